@@ -232,7 +232,7 @@ class TrainConf:
     record_every: int = 10
     """Record the first, every such, the last and the best episode to run.h5; 0 records nothing."""
     frame_every: int = 1
-    """Control steps between two recorded frames."""
+    """Control steps between two recorded frames; the last one is recorded in any case."""
     examine: bool = True
     """Examine the best motion at the end of a run: three times as long, kicked, with other friction, on the next finer grid. False also
     leaves out the last evaluations of the best, from other starts, after which a settled run may end with its next best instead."""

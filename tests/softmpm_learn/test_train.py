@@ -548,6 +548,26 @@ def test_the_recording_holds_the_run(task, model, settings, tmp_path):
     ] == pytest.approx(losses)
 
 
+def test_the_last_frame_is_recorded(task, model, settings, tmp_path):
+    """Where the frames do not divide the episode too: its end is what a picture and the last words show."""
+    steps = task.control_steps
+    conf = changed(settings, train=dict(iterations=1, record_every=1, frame_every=steps - 1))
+    train.train(task, model, conf, tmp_path)
+    with softmpm.Recording(tmp_path / "run.h5") as recording:
+        frames = recording.frames(0)
+    assert np.allclose(frames["time"], task.control_period * np.array([0, steps - 1, steps]))
+    assert np.isfinite(frames["activation"][:2]).all() and np.isnan(frames["activation"][2]).all()
+
+
+def test_without_replay_a_phase_sees_every_world(task, settings, tmp_path):
+    """The buffer has room for the simulations of all iterations between two phases, and takes them."""
+    model = softmpm.build(task.scene, device="cpu", worlds=3)
+    conf = changed(settings, learning=dict(replay=False, every=2), train=dict(worlds=3))
+    run = train.Run(task, model, conf, tmp_path)
+    assert run.learner is not None
+    assert (run.learner.replay.capacity, run.learner.replay.per_iteration) == (6, 3)
+
+
 def test_no_learning_without_a_learned_observer(task, model, settings, tmp_path):
     """Centroids need no replay buffer: none is written, and learning columns stay empty."""
     train.train(task, model, changed(settings, observer=dict(name="centroids")), tmp_path)

@@ -123,6 +123,7 @@ def make_learner(
         megabytes=conf.megabytes,
         validation=conf.validation,
         worlds=worlds,
+        iterations=None if conf.replay else conf.every,
         device=model.device,
     )
     return Learner(conf, autoencoder.to(model.device, model.dtype), replay, settings.train.seed)

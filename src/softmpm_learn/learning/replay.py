@@ -60,6 +60,7 @@ class Replay:
         megabytes: Most memory [MB]; at least the newest simulation stays.
         validation: Share of the iterations held out, see :func:`split_of`.
         worlds: Simulations of an iteration: number n is of iteration n // worlds.
+        iterations: Iterations that it has to span, at most a cycle of the split.
         device: Where the pictures are.
     """
 
@@ -72,11 +73,13 @@ class Replay:
         megabytes: float = math.inf,
         validation: float = 0.2,
         worlds: int = 1,
+        iterations: int | None = None,
         device: torch.device | str = "cpu",
     ):
         self.folder, self.shape, self.device = folder, shape, device
         self.simulations, self.megabytes = simulations, megabytes
         self.validation, self.worlds = validation, worlds
+        self.iterations = min(iterations or cycle(validation), cycle(validation))
         self._slots: dict[int, int] = {}
         self._next = 0
         self._sha256: dict[int, str] = {}
@@ -91,8 +94,8 @@ class Replay:
 
     @property
     def per_iteration(self) -> int:
-        """Most simulations of an iteration, so that the buffer spans a cycle of the split and has both kinds."""
-        return max(1, self.capacity // cycle(self.validation))
+        """Most simulations of an iteration, so that the buffer spans ``iterations``: a cycle of the split has both kinds."""
+        return max(1, self.capacity // self.iterations)
 
     @cached_property
     def memory(self) -> Tensor:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -104,15 +105,12 @@ class RunFiles:
     def _open_recorder(self) -> softmpm.Recorder:
         """Go on with the recording, if it is the one that the checkpoint knows; begin one where there is none."""
         path, known = self.out / "run.h5", self._recorded
-        every = self.run.settings.train.frame_every
         if known is not None and not path.exists():
             logger.warning("%s is missing; what was recorded up to here is lost, and a new one begins.", path)
             known = None
         before, digest = (known["before"], known["sha256"]) if known else (0, None)
         try:
-            return softmpm.Recorder(
-                path, self.run.model, resume_before=before, resume_digest=digest, every=every
-            )
+            return softmpm.Recorder(path, self.run.model, resume_before=before, resume_digest=digest)
         except (OSError, ValueError) as error:
             if isinstance(error, OSError) and error.errno is not None:
                 raise  # no room on the disk
@@ -201,15 +199,18 @@ class RunFiles:
 
     @contextlib.contextmanager
     def episode(self, world: int, **about) -> Iterator[Callable[..., None]]:
-        """Record an episode of this world: gives what to call at each frame, with grid velocity and contact forces."""
+        """Record an episode of this world: gives what to call at each frame, with grid velocity and contact forces. The last frame,
+        which has no activation, is recorded in any case."""
         assert self._recorder is not None
         self.frames.clear()
+        every, number = self.run.settings.train.frame_every, itertools.count()
         with self._recorder.episode(self.run.iteration, task=self.run.task.name, **about) as episode:
 
             def keep(frame: Frame, velocity: Tensor, forces: softmpm.ContactForces | None) -> None:
                 features = frame.features[:, : self.run.observer.size]  # beside it may be a run with more
                 seen = frame.state, frame.activation, velocity, features, forces
-                episode.frame(frame.time, *seen, world=world)
+                if next(number) % every == 0 or frame.activation is None:
+                    episode.frame(frame.time, *seen, world=world)
                 activation = None if frame.activation is None else frame.activation[world].detach()
                 self.frames.append((frame.time, frame.state.x[world].detach(), activation))
 

@@ -96,6 +96,8 @@ def test_many_worlds_leave_room_for_both_sides(tmp_path):
         (dict(simulations=50), 10),
         (dict(simulations=50, megabytes=31 * size), 6),
         (dict(simulations=4), 1),
+        (dict(simulations=8, worlds=4, iterations=2), 4),  # without replay: all that a phase learns from
+        (dict(simulations=40, worlds=4, iterations=10), 8),
     )
     for limits, most in cases:
         assert filled(tmp_path, 0, **limits).per_iteration == most
