@@ -115,7 +115,9 @@ def _check_stays(model: ModelLike, given: dict[str, Tensor], k: int) -> None:
         value = given.get(name)
         if value is None:
             return torch.tensor(otherwise, dtype=torch.float64)
-        return value.double().cpu().select(-axes, k if value.shape[-axes] > 1 else 0)
+        value = value.double().cpu()[(None,) * (axes - value.ndim)]
+        value = value.expand(*value.shape[:-1], model.dim) if axes == 2 else value
+        return value.select(-axes, k if value.shape[-axes] > 1 else 0)
 
     normal, velocity = of_wall("wall_normal", 2, wall.normal), of_wall("wall_velocity", 2, 0.0)
     length = normal.norm(dim=-1)

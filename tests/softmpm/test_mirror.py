@@ -316,6 +316,24 @@ def test_walls_that_reflect_do_not_move(name, changes):
             call()
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_walls_that_reflect_know_inputs_of_any_shape(dim):
+    """One number or vector for all walls has neither the axis of the walls nor those before."""
+    model = build(corner(dim), inputs=("wall_offset",))
+
+    def call(**given):
+        inputs = softmpm.Inputs(**given)
+        softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, inputs=inputs)
+
+    for shape in ((), (1,), (dim,)):
+        call(wall_velocity=torch.zeros(shape, dtype=model.dtype))
+        with pytest.raises(ValueError, match=r"inputs\.wall_velocity must leave wall 0"):
+            call(wall_velocity=torch.ones(shape, dtype=model.dtype))
+    for name in ("wall_offset", "wall_normal"):
+        with pytest.raises(ValueError, match=rf"inputs\.{name} must leave wall 0"):
+            call(**{name: torch.tensor(0.5, dtype=torch.float64)})
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("away", [0.4, -0.4])
 def test_a_face_off_the_plane_is_refused(side, away):
