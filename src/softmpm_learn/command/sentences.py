@@ -62,9 +62,9 @@ def sentence(error: BaseException) -> str:
         return f"{error.full_key}: {_line(str(error).splitlines()[0])}"
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        may_be_own = not plugins.loaded and group in (table.what for table in CHOICES)
-        file = f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
-        file = file if may_be_own else ""
+        file = ""
+        if not plugins.loaded and group in (table.what for table in CHOICES):
+            file = f" One of your own needs its file: {plugins.command()} FILE.py {group}={name}"
         return f"there is no {group} called {name}; choose one of {', '.join(error.options)}.{file}"
     if is_lost(error):
         return "another process of this run has ended; its own message says why, or torchrun reports the signal that killed it."

@@ -13,15 +13,10 @@ from softmpm_learn.storage import sweep
 from softmpm_learn.storage.sweep import EXAMINED
 
 SEEDS = "train.seed", "train.seeds"
-FREE = (
-    "train.log",
-    "train.record_every",
-    "train.frame_every",
-    "train.examine",
-    "train.save_every",
-    "train.pictures",
+INDIFFERENT = (
+    *(*SEEDS, "train.log", "train.record_every", "train.frame_every", "train.examine", "train.save_every"),
+    *("train.pictures", "train.side_by_side", "device.threads", "device.memory", "resume"),
 )
-INDIFFERENT = *SEEDS, *FREE, "train.side_by_side", "device.threads", "device.memory", "resume"
 """Settings by which runs do not become others, the seed apart."""
 PIECE = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|\\[\\()[\]{}:=, \t]|.""", re.DOTALL)
 """A quoted text, an escaped character or another one."""
