@@ -7,6 +7,8 @@ observer also trains on the observations. Both are differentiable.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -98,6 +100,34 @@ def clusters(positions: np.ndarray, count: int) -> list[np.ndarray]:
     return [np.flatnonzero(label == k) for k in np.unique(label)]
 
 
+@dataclass(kw_only=True)
+class _View:
+    """Place of a window in a grid."""
+
+    middle: Tensor
+    """Node on which the centroid of the robot lies [m]."""
+    low: Tensor
+    high: Tensor
+    """Limits of the particles [m]."""
+    pad: list[int]
+    """Nodes of the window before and after the grid, for each axis from the last; negative where the window is smaller."""
+
+    @classmethod
+    def of(cls, model: Model, window: Sequence[int], follow: bool) -> Self:
+        """View of a window around the middle of the grid, or of the whole grid."""
+        grid, place = model.scene.grid, {"dtype": model.dtype, "device": model.device}
+        middle = [(n - 1) // 2 for n in grid.shape]
+        first = [m - w // 2 for m, w in zip(middle, window, strict=True)] if follow else [0] * model.dim
+        ends = [(-f, f + w - n) for f, w, n in zip(first, window, grid.shape, strict=True)]
+        last = torch.tensor(grid.shape, **place) - 1
+        return cls(
+            middle=torch.tensor(middle, **place) * grid.spacing,
+            low=torch.full_like(last, grid.spacing),
+            high=(last - 1) * grid.spacing,
+            pad=[nodes for pair in reversed(ends) for nodes in pair],
+        )
+
+
 class VelocityImage:
     """Grid velocity as a learned observer sees it: averaged over blocks of nodes, components first. With posture, the displacement from
     rest as well, that of the centroid left out: the velocity at which the robot would come from rest in :data:`PACE`.
@@ -118,36 +148,55 @@ class VelocityImage:
         grid = model.scene.grid
         self.follow, self.posture, self.channels = follow, posture, model.dim * (1 + posture)
         self._rest = model.positions - model.positions.mean(dim=0)
-        window = (_window(model),) * model.dim if follow else grid.shape
+        self._window = (_window(model),) * model.dim if follow else grid.shape
         usual = (32 if model.dim == 2 else 16) * (1 if follow else 2)
-        self.block = math.ceil(max(window) / (nodes or usual))
-        self.shape = tuple(math.ceil(n / self.block) for n in window)
+        self.block = math.ceil(max(self._window) / (nodes or usual))
+        self.shape = tuple(math.ceil(n / self.block) for n in self._window)
         mass = (model.params().density * model.volume).sum() / model.volume.sum() * grid.spacing**model.dim
         self._thin = THIN * mass.item()
-        place = {"dtype": model.dtype, "device": model.device}
-        last = torch.tensor(grid.shape, **place) - 1
-        self._low, self._high = torch.full_like(last, grid.spacing), (last - 1) * grid.spacing
-        middle = [(n - 1) // 2 for n in grid.shape]
-        self._middle = torch.tensor(middle, **place) * grid.spacing
-        first = [m - w // 2 for m, w in zip(middle, window, strict=True)] if follow else [0] * model.dim
-        ends = [(-f, f + w - n) for f, w, n in zip(first, window, grid.shape, strict=True)]
-        self._pad = [pad for pair in reversed(ends) for pad in pair]
+        self._spacing, self._views = grid.spacing, dict[tuple[int, ...], _View]()
+        self._view(model)  # while a graph is captured nothing can be copied to a GPU
 
     def __call__(self, model: Model, state: State) -> Tensor:
-        """Velocity [m/s], then the displacement over :data:`PACE`, shape (world, channels, *shape)."""
+        """Velocity [m/s], then the displacement over :data:`PACE`, shape (world, channels, *shape).
+
+        Args:
+            model: The one of the picture, or the same robot on another track.
+
+        Raises:
+            ValueError: The cells are of another size, or the whole grid is shown and has another shape.
+        """
+        view = self._view(model)
         centred = state.x - state.x.mean(dim=1, keepdim=True)
         if self.follow:
-            state = state._replace(x=(centred + self._middle).clamp(self._low, self._high))
+            state = state._replace(x=(centred + view.middle).clamp(view.low, view.high))
         if not self.posture:
-            return self._seen(model, state)
+            return self._seen(model, state, view)
         away = state._replace(v=(centred - self._rest) / PACE, C=torch.zeros_like(state.C))
-        return torch.cat([self._seen(model, state), self._seen(model, away)], dim=1)
+        return torch.cat([self._seen(model, state, view), self._seen(model, away, view)], dim=1)
 
-    def _seen(self, model: Model, state: State) -> Tensor:
+    def _view(self, model: Model) -> _View:
+        """View of the grid of a model."""
+        grid = model.scene.grid
+        if not math.isclose(grid.spacing, self._spacing):
+            raise ValueError(
+                f"the observer was built for cells of {self._spacing:.5g} m, of which its window has a fixed number; got a model with "
+                f"cells of {grid.spacing:.5g} m. Build the observer again with this model."
+            )
+        if grid.shape not in self._views:
+            if not self.follow and self._views:
+                raise ValueError(
+                    f"an observer with follow=False sees the whole grid, of {self._window} nodes; got a model with {grid.shape}. Take "
+                    "follow=True, whose window follows the robot on any track."
+                )
+            self._views[grid.shape] = _View.of(model, self._window, self.follow)
+        return self._views[grid.shape]
+
+    def _seen(self, model: Model, state: State, view: _View) -> Tensor:
         """Picture of the velocities of a state."""
         field = softmpm.rasterize(model, state)
         velocity = field.velocity * (field.mass / (field.mass + self._thin))[..., None]
-        seen = functional.pad(velocity.movedim(-1, 1), self._pad)  # negative where the window is smaller
+        seen = functional.pad(velocity.movedim(-1, 1), view.pad)  # negative where the window is smaller
         pool, size = functional.avg_pool2d if model.dim == 2 else functional.avg_pool3d, self.block
         # The blocks at the far ends reach beyond the window, where there is nothing:
         return pool(seen, size, ceil_mode=True, divisor_override=size**model.dim)

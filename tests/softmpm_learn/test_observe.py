@@ -95,8 +95,24 @@ def test_a_track_of_any_size_gives_the_same_picture(make_block, shape, away):
     moved = state._replace(x=state.x + torch.tensor(away, dtype=torch.float64))
     near, far = VelocityImage(here), VelocityImage(there)
     assert near.shape == far.shape
-    torch.testing.assert_close(far(there, moved), near(here, state), rtol=1e-9, atol=1e-12)
-    assert near(here, state).abs().max() > 0.1
+    seen = near(here, state)
+    for picture in (near, far):
+        torch.testing.assert_close(picture(there, moved), seen, rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(picture(here, state), seen, rtol=1e-9, atol=1e-12)
+    assert seen.abs().max() > 0.1
+
+
+def test_a_picture_of_another_grid_is_refused(make_block):
+    """Cells of another size have another window; the whole of another grid has another shape."""
+    here, there = build(make_block, (13, 9)), build(make_block, (40, 9))
+    scene = dataclasses.replace(here.scene, grid=dataclasses.replace(here.scene.grid, spacing=0.08))
+    larger = softmpm.build(scene, device="cpu", dtype=torch.float64)
+    with pytest.raises(
+        ValueError, match=r"cells of 0\.1 m.*got a model with cells of 0\.08 m.*Build the observer again"
+    ):
+        VelocityImage(here)(larger, moving(larger))
+    with pytest.raises(ValueError, match=r"of \(13, 9\) nodes; got a model with \(40, 9\).*Take follow=True"):
+        VelocityImage(here, follow=False)(there, moving(there))
 
 
 @pytest.mark.parametrize("nodes", [5, None])
