@@ -91,7 +91,12 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
         results = experiments([(one.conf, one.out) for one in jobs], group, signals)
     except JobError as failure:
         if len(jobs) == 1 or isinstance(failure, RefusedError) or group.size > 1:
-            return fail(jobs, failure, group, failed)
+            losses = fail(jobs, failure, group, failed)
+            if group.size > 1:
+                raise SystemExit(
+                    1
+                ) from failure  # the processes may no longer be in step; the same command goes on
+            return losses
         problem = str(failure)
     except (ValueError, OSError) as error:
         give_up(error)
@@ -121,7 +126,8 @@ def _record(mine: Job, results: Sequence[Result], group: Group, failed: dict[int
     if found is None:
         return None
     if found.status == "failed":
-        return fail([mine], JobError(found.error, found.iterations), group, failed)[0]
+        said = found.error if group.first else ""  # all processes know it
+        return fail([mine], JobError(said, found.iterations), group, failed)[0]
     _tabulate(mine, found, group)
     return found.loss
 
@@ -139,8 +145,6 @@ def fail(jobs: Sequence[Job], failure: JobError, group: Group, failed: dict[int,
     for mine in jobs:
         failed[mine.number] = mine.table
         _tabulate(mine, failure.outcome(mine.about), group)
-    if group.size > 1:
-        raise SystemExit(1)  # the processes may no longer be in step; the same command goes on
     return [math.inf] * len(jobs)
 
 

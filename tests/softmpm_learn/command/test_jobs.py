@@ -20,6 +20,7 @@ from softmpm_learn.command import app, experiment, jobs
 from softmpm_learn.command.jobs import Job, side_by_side
 from softmpm_learn.config import RunConf
 from softmpm_learn.settings import ObserverConf, OptimizerConf, TrainConf
+from softmpm_learn.storage.sweep import Outcome
 from softmpm_learn.tasks import ArmConf, BipedConf
 
 pytestmark = pytest.mark.usefixtures("in_folder")
@@ -194,3 +195,34 @@ def test_jobs_side_by_side_are_of_one_kind_of_run(tmp_path):
     other = dataclasses.replace(conf, optimizer=OptimizerConf(fade=0.5))
     with pytest.raises(ValueError, match=r"runs side by side share optimizer\.fade"):
         jobs.run_side_by_side([(conf, tmp_path / "a"), (other, tmp_path / "b")])
+
+
+def test_processes_in_step_record_each_job(tmp_path, monkeypatch):
+    """Results are of processes in step: of two jobs side by side, the one that failed ends neither the command nor the other's row."""
+    table = tmp_path / "sweep.csv"
+    ended = [Outcome(job=0, status="failed", error="no way back", settings="", folder="0")]
+    ended += [Outcome(job=1, status="finished", loss=1.5, settings="", folder="1")]
+    some = [Job(number=k, settings="", out=tmp_path / str(k), table=table) for k in range(2)]
+    for one in some:
+        one.out.mkdir()
+    failed, group = {}, types.SimpleNamespace(size=2, rank=0, first=True)
+    monkeypatch.setattr(jobs, "experiments", lambda *_: [[None], [None]])
+    monkeypatch.setattr(jobs, "outcome", lambda conf, out, *_: ended[int(out.name)])
+    assert jobs.run_jobs(some, group, None, failed) == [math.inf, 1.5]
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [row["status"] for row in rows] == ["failed", "finished"] and failed == {0: table}
+
+
+def test_processes_out_of_step_end_with_the_job(tmp_path, monkeypatch):
+    """After an error the processes may wait for each other: the job has its row, and the command ends."""
+    one = Job(number=0, settings="", out=tmp_path / "0", table=tmp_path / "sweep.csv")
+    one.out.mkdir()
+
+    def fails(*_):
+        raise jobs.JobError("lost")
+
+    monkeypatch.setattr(jobs, "experiments", fails)
+    with pytest.raises(SystemExit):
+        jobs.run_jobs([one], types.SimpleNamespace(size=2, rank=0, first=True), None, {})
+    (row,) = csv.DictReader(one.table.read_text().splitlines())
+    assert (row["status"], row["error"]) == ("failed", "lost")
