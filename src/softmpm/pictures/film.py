@@ -51,7 +51,7 @@ def to_video(
 
     Args:
         source: A recording, states one after the other, or the frames of a :func:`softmpm.trajectory`, which are a state each.
-        path: File to write, ``.gif`` or ``.mp4`` (``pip install 'softmpm[video]'``). An older one is replaced.
+        path: File to write, ``.gif`` or ``.mp4`` (``pip install "softmpm[video]"``). An older one is replaced.
         model: What the states belong to.
         activation: Activation [-] of each state, shape (state, world, muscle).
         period: Simulated time between two states [s]; None shows each state in one picture.
@@ -227,7 +227,7 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
         import imageio_ffmpeg
     except ImportError as error:
         raise ImportError(
-            "an MP4 needs the package imageio-ffmpeg: pip install 'softmpm[video]'. A .gif needs no further package."
+            'an MP4 needs the package imageio-ffmpeg: pip install "softmpm[video]". A .gif needs no further package.'
         ) from error
     writer = None
     try:

@@ -236,7 +236,7 @@ def _load(path: "str | os.PathLike[str]") -> Any:
         return trimesh.load_mesh(path)
     except ImportError as error:
         raise ImportError(
-            f"reading the mesh {os.fspath(path)!r} needs the package {error.name or 'trimesh'}: pip install 'softmpm[mesh]'."
+            f'reading the mesh {os.fspath(path)!r} needs the package {error.name or "trimesh"}: pip install "softmpm[mesh]".'
         ) from error
     except Exception as error:  # a damaged file meets any error of trimesh's readers, their own mistakes too
         raise ValueError(

@@ -207,7 +207,7 @@ def _cut_image(
 def mesh(
     source: "str | os.PathLike[str] | trimesh.Trimesh", spacing: float, *, cut_cells: bool = False
 ) -> Particles:
-    """Fill a closed triangle mesh with particles; needs trimesh (``pip install 'softmpm[mesh]'``).
+    """Fill a closed triangle mesh with particles; needs trimesh (``pip install "softmpm[mesh]"``).
 
     Parts of a mesh may overlap. A part whose faces turn inwards is a cavity and lies within the others.
 

@@ -38,7 +38,7 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         key, _, value = str(error).removeprefix("Error merging override ").partition("=")
         if value and "is not a ListConfig" in str(error.__cause__):
-            written = f"'{key}=[{value.strip(QUOTES)}]'"
+            written = f'"{key}=[{value.strip(QUOTES)}]"'
             return f"{key} must be a list, got {value}: write {written}, with a comma between several values."
         return sentence(error.__cause__)
     cause = error.__cause__ or error.__context__

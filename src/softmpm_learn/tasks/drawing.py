@@ -134,7 +134,9 @@ def _check_pieces(conf: OwnConf, whole: np.ndarray) -> None:
     piece = pieces(whole)
     count = int(piece.max())
     if count == 0:
-        raise ValueError(f"the robot of {conf.file} is empty.")
+        raise ValueError(
+            f"the robot of {conf.file} is empty: all of it is white, transparent or voxels of 0. Draw a body."
+        )
     if count > 1:
         sizes = np.bincount(piece.ravel())[1:]
         smallest = int(sizes.argmin()) + 1

@@ -72,8 +72,8 @@ def unknown_colour(name: str, legend: Iterable[str]) -> str:
 
 
 def _addition(name: str, colour: str = "#rrggbb") -> str:
-    """Word of the command line that adds a colour to the legend."""
-    return f"'+task.legend.{name}={{colour:\"{colour}\",muscle:true}}'"
+    """Word of the command line, in quotes for any shell, that adds a colour to the legend."""
+    return f"\"+task.legend.{name}={{colour:'{colour}',muscle:true}}\""
 
 
 def _colour(name: str, entry: Any, legend: Iterable[str]) -> Colour:

@@ -107,7 +107,7 @@ def _read(path: Path) -> Any:
         if not len(surface.faces):
             raise ValueError("it has no triangles")
     except ImportError as error:
-        raise ImportError(f"reading {path} needs {error.name}: pip install 'softmpm[mesh]'.") from error
+        raise ImportError(f'reading {path} needs {error.name}: pip install "softmpm[mesh]".') from error
     except Exception as error:  # a damaged file meets any error of trimesh's readers
         raise ValueError(f"{path} cannot be read as a mesh: {type(error).__name__}: {error}") from error
     return surface

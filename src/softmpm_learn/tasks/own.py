@@ -72,6 +72,8 @@ class OwnConf(WalkerConf):
         if not self.file:
             raise ValueError(f"task {self.name} reads {what}: task.file=FILE.")
         path = Path(self.file)
+        if path.is_dir():
+            raise ValueError(f"task.file = {self.file} is a folder; name the file in it.")
         if not path.is_file():
             raise ValueError(
                 f"task.file = {self.file}: there is no such file; put it there, or correct the path, of a run in its config.yaml."
@@ -109,7 +111,10 @@ def walker(
     grid, walls, height = track(conf)
     _check_size(conf, rest, grid, height)
     if not muscles:
-        raise ValueError(f"{conf.file} has no muscle, so nothing would move.")
+        raise ValueError(
+            f"{conf.file} has no muscle, so nothing would move: draw a part in the colour of a muscle of task.legend, such as red "
+            "#ff0000, or give voxels the number 3 or 4."
+        )
     for muscle in muscles:
         if not len(muscle.particles):
             raise ValueError(

@@ -277,7 +277,7 @@ def test_missing_file_and_library(monkeypatch, tmp_path):
     path = tmp_path / "robot.stl"
     path.write_bytes(b"")
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r"pip install 'softmpm\[mesh\]'"):
+    with pytest.raises(ImportError, match=r'pip install "softmpm\[mesh\]"'):
         mesh(path, 0.1)
 
 
@@ -333,6 +333,7 @@ def test_a_missing_part_of_trimesh_is_named(tmp_path, monkeypatch):
     path.write_bytes(b"\xff\xfe v")
     monkeypatch.setitem(sys.modules, "charset_normalizer", None)
     with pytest.raises(
-        ImportError, match=r"robot\.obj' needs the package charset_normalizer: pip install 'softmpm\[mesh\]'"
+        ImportError,
+        match=r'''robot\.obj' needs the package charset_normalizer: pip install "softmpm\[mesh\]"''',
     ):
         closed_surface(path)

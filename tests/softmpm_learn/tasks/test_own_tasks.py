@@ -423,7 +423,7 @@ def test_the_legend_decides(folder):
     "word, says",
     [
         ("task.legend.rot.angle=90", "task.legend has no rot; known are passive, stiff, red, "),
-        ("+task.legend.rot.angle=90", """purple. Add one with '+task.legend.rot={colour:"#rrggbb",muscle:true}'."""),
+        ("+task.legend.rot.angle=90", """purple. Add one with "+task.legend.rot={colour:'#rrggbb',muscle:true}"."""),
         ("+task.legend.rot=90", "task.legend has no rot; known are passive, stiff, red, "),
         ('+task.legend.brown={color:"#8b4513"}', "task.legend.brown has no color; known are colour, muscle, angle, stiffness."),
         ("+task.legend.brown={colour:5}", "a colour of task.legend must be #rrggbb, got 5."),
@@ -431,6 +431,7 @@ def test_the_legend_decides(folder):
         ('+task.legend.brown={colour:"#8b4513",muscle:9}', "muscle in task.legend must be true or false, got 9."),
         ('+task.legend.brown={colour:"#8b4513",angle:up}', "angle in task.legend must be a number of degrees or null, got 'up'."),
         ('+task.legend.brown={colour:"#8b4513",stiffness:x}', "stiffness in task.legend must be a number > 0, got 'x'."),
+        ("+task.legend.red.angel=90", "there is no setting task.legend.red.angel; did you mean task.legend.red.angle?"),
         ("task.legend.red.angel=90", "there is no setting task.legend.red.angel; did you mean task.legend.red.angle?"),
     ],
 )  # fmt: skip
@@ -536,18 +537,19 @@ def squeezed(kind: str) -> None:
     [
         (lambda: None, ImageConf, dict(), "task image reads a picture of the robot: task.file=FILE"),
         (lambda: None, ImageConf, dict(file="none.png"), "task.file = .*/none.png: there is no such file"),
+        (lambda: Path("robots").mkdir(), ImageConf, dict(file="robots"), "task.file = .*robots is a folder; name the file in it"),
         (lambda: None, ImageConf, dict(file="robot.npy"), "robot.npy cannot be read as a picture"),
         (
             lambda: painted(c8b4513=(30, 30, 49, 44)),
             ImageConf, dict(file="wrong.png"),
-            r"has 2[0-9]{2} pixels of the colour #8b4513, which the legend lacks.*'\+task.legend.NAME=\{colour:\"#8b4513\"",
+            r"has 2[0-9]{2} pixels of the colour #8b4513, which the legend lacks.*\"\+task.legend.NAME=\{colour:'#8b4513'",
         ),
         (lambda: painted(c8b4513=(50, 50, 52, 52)), ImageConf, dict(file="wrong.png"), "has 1 pixel of the colour"),
         (lambda: squeezed("JPEG"), ImageConf, dict(file="wrong.png"), "lacks; JPEG changes colours .*: save the drawing itself as PNG"),
         (lambda: squeezed("WEBP"), ImageConf, dict(file="wrong.png"), "lacks; WEBP changes colours .*: save the drawing itself as PNG"),
         (lambda: Image.new("RGB", (30, 30), "white").save("wrong.png"), ImageConf, dict(file="wrong.png"), "is empty"),
         (lambda: painted(cffffff=(0, 78, 239, 84)), ImageConf, dict(file="wrong.png"), "in 3 pieces.*fall apart"),
-        (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf, dict(file="wrong.png"), "no muscle"),
+        (lambda: painted(cffffff=(0, 80, 239, 139)), ImageConf, dict(file="wrong.png"), "no muscle.*such as red #ff0000, or"),
         (lambda: None, ImageConf, dict(file="robot.png", size=2.0), "is 2 m long and 1 m high; the track of 7 m has room for"),
         (lambda: None, ImageConf, dict(file="robot.png", size=0.02), "too small for cells of 0.0125 m"),
         (lambda: painted(c0000ff=(30, 30, 33, 33)), ImageConf, dict(file="wrong.png", cells=20), "blue .* is smaller than a particle"),
