@@ -163,9 +163,12 @@ def to_run(config: DictConfig) -> RunConf:
 def check_keys(config: DictConfig, path: str = "") -> None:
     """Raise ValueError for keys that the schema does not have: Hydra lets ``+key=value`` pass."""
     kind = OmegaConf.get_type(config)
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):  # else a dict, with names of the user's
+        known = {field.name for field in dataclasses.fields(kind)}
+        unknown = [str(key) for key in config if key not in known]
+        if unknown:
+            raise ValueError(unknown_key(f"{path}{unknown[0]}", kind))
     for key in config:
-        if dataclasses.is_dataclass(kind) and key not in {field.name for field in dataclasses.fields(kind)}:
-            raise ValueError(unknown_key(f"{path}{key}", kind))
         if not OmegaConf.is_missing(config, key) and isinstance(child := config[key], DictConfig):
             check_keys(child, f"{path}{key}.")
 
