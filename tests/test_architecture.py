@@ -43,7 +43,8 @@ LAYERS = """
 """
 """From the ground up. Each word is a module or a package; those of one line do not import each other."""
 LEARNER_LAYERS = """
-    distributed seeding setting_checks storage autoencoder term fading
+    distributed seeding modes unchanged likeness setting_checks storage autoencoder fading
+    term
     objective
     lasting
     tasks.task figures
@@ -51,6 +52,7 @@ LEARNER_LAYERS = """
     plugins optimizer_settings tasks loggers
     settings optimizers
     config design observe policy recovery
+    observer_check
     episode learning gym
     runs
     training

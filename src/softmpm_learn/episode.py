@@ -10,9 +10,11 @@ from torch import Tensor, nn
 import softmpm
 from softmpm import Inputs, Model, Params, State
 from softmpm_learn.fading import Fading
+from softmpm_learn.likeness import alike
 from softmpm_learn.observe import Observer
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.term import Path
+from softmpm_learn.unchanged import need_unchanged, versions
 
 Policy = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 """Features, time and goal to activation, see :class:`softmpm_learn.policy.Space`."""
@@ -103,16 +105,22 @@ def run_episode(
             activation from then on, or it would fail again and again.
 
     Raises:
-        ValueError: Parameters or buffers of the observer or the policy have another precision than the model.
+        ValueError: The model is of another scene, parameters or buffers of the observer or the policy have another precision than the
+            model, or the observer or a term works in place.
         softmpm.UnstableError: With a note that names the control step, as those have that are collected or met in a backward pass.
     """
+    need_scene_of(task, model)
     _check_precision(model, observer=observer, policy=policy)
     state = model.rest() if start is None else start
     period, times = task.control_period, times_of(task, model)
     made, states, observations, fading = Decisions(), [state], [], Fading(fade, period)
     for step in range(task.control_steps):
         with softmpm.noted(note_of(step, task)):
+            before = versions(state[:4])
             observation = observer.observe(model, state)
+            need_unchanged(
+                f"the observer {type(observer).__name__}", "the state", before, versions(state[:4])
+            )
             if keep_every and step % keep_every == 0:
                 observations.append(observation.detach())
             features = observer.encode(observation)
@@ -160,6 +168,29 @@ def _check_precision(model: Model, **parts: Policy | Observer) -> None:
                     f"the {what} must be {model.dtype} like the model, has {tensor.dtype}; use {what}.to({model.dtype}), or build the "
                     "model with another dtype, as run.model_of does for a run."
                 )
+
+
+def need_scene_of(task: Task, model: Model) -> None:
+    """Raise ValueError unless a model is of the task's scene: everything in it was read when the model was built."""
+    if not alike(model.scene, task.scene):
+        raise ValueError(
+            f"the model was built from another scene than that of task {task.name}; build it from this one, with "
+            "softmpm.build(task.scene, **task.build), or with run.model_of(task, worlds) where there is a run."
+        )
+
+
+def need_model_of(task: Task, model: Model) -> None:
+    """Raise ValueError unless a model is of the task's scene, with its formulation and its contact."""
+    need_scene_of(task, model)
+    got = {"formulation": model.formulation, "contact": "nodes" if model.surface is None else "surface"}
+    got |= {"contact_width": model.contact_width}
+    wanted = {name: task.build[name] for name in got if name in task.build}
+    other = [name for name, value in wanted.items() if got[name] != value]
+    if other:
+        raise ValueError(
+            f"task {task.name} has {other[0]}={wanted[other[0]]!r}, but the model has {got[other[0]]!r}; build it with "
+            "softmpm.build(task.scene, **task.build)."
+        )
 
 
 def kicked(state: State, kicks: Tensor) -> State:

@@ -24,6 +24,7 @@ from typing import ClassVar
 import numpy as np
 from torch import Tensor
 
+from softmpm_learn.setting_checks import particles
 from softmpm_learn.term import Path, Sum, Term, check_terms
 
 
@@ -157,6 +158,8 @@ class Tilt(Term):
     """Vertical axis."""
 
     def __post_init__(self):
+        particles("Tilt.front", self.front)
+        particles("Tilt.back", self.back)
         if self.rest.shape[1] == 3 and not np.allclose(self.vectors, np.eye(3)[self.horizontal], atol=1e-6):
             raise ValueError(
                 "Tilt needs parts that have an extent along each horizontal axis: give it more particles."

@@ -1,10 +1,13 @@
 """Random streams: one for each part of a run, so that a change of one part leaves the random numbers of the others as they are."""
 
 import hashlib
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+
+_LOCK = threading.RLock()
 
 
 def stream_seed(seed: int, name: str) -> int:
@@ -18,9 +21,11 @@ def stream(seed: int, name: str) -> torch.Generator:
 
 
 @contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Layers made inside start with weights that follow from ``seed`` alone; make them on the CPU, then move them. PyTorch's global
-    random state is unchanged."""
-    with torch.random.fork_rng(devices=[]):
+def seeded(seed: int, device: torch.device | None = None) -> Iterator[None]:
+    """Random numbers drawn inside follow from ``seed`` alone, on the CPU and, if it is given, on a GPU. Layers are made on the CPU, not
+    on a default device of the caller's; move them afterwards. PyTorch's global random state is unchanged; it is that of all threads,
+    so that only one of them is inside."""
+    devices = [device] if device is not None and device.type == "cuda" else []
+    with _LOCK, torch.device("cpu"), torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
         yield

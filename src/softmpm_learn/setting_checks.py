@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+
 
 def _is(kind: type, value: Any) -> bool:
     """True for a number of a kind; True and False are none, although Python counts them as whole numbers."""
@@ -85,3 +87,15 @@ def lengths(name: str, values) -> None:
         raise ValueError(
             f"{name} must be a list of lengths ≥ 0 [m], one for each axis, such as [0.05, 0.05], got {shown!r}."
         )
+
+
+def particles(name: str, values: Any) -> None:
+    """Raise ValueError unless values are indices of particles, at least one, none twice."""
+    found = np.asarray(values)
+    if not (found.ndim == 1 and found.size and np.issubdtype(found.dtype, np.integer)):
+        raise ValueError(
+            f"{name} must be a list of particle indices, not empty, got an array of {found.dtype}, shape {found.shape}; "
+            "np.flatnonzero(mask) makes one."
+        )
+    if len(np.unique(found)) < found.size:
+        raise ValueError(f"{name} names a particle twice; give each index once.")

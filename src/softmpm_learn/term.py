@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from softmpm import State
+from softmpm_learn.unchanged import need_unchanged, versions
 
 Sum = Literal["states", "steps", "way"]
 """Sum that a term's value is, see :attr:`Term.adds_up`."""
@@ -47,6 +48,14 @@ class Path:
     def v(self) -> Tensor:
         """Velocities [m/s], shape (state, world, particle, dim). Differentiable."""
         return torch.stack([state.v for state in self.states])
+
+    @property
+    def versions(self) -> list[int]:
+        """Changes of each part in place, a number each; 0 for a part that no term has read."""
+        stacks = vars(self).get("x"), vars(self).get("v")
+        return versions(
+            [*stacks, self.activation, self.goal, *(part for one in self.states for part in one[:4])]
+        )
 
 
 class Placed:
@@ -101,9 +110,12 @@ class Term(Placed, ABC):
         """The value, shape (world,).
 
         Raises:
-            ValueError: It has another shape. One number for all would add to the loss of each world, and to the gradients of others.
+            ValueError: It was computed in place, or has another shape. One number for all would add to the loss of each world, and to
+                the gradients of others.
         """
-        value, wanted = self.value(path), tuple(path.states[0].x.shape[:1])
+        before, value = path.versions, self.value(path)
+        need_unchanged(f"the objective's term {self.name}", "the motion", before, path.versions)
+        wanted = tuple(path.states[0].x.shape[:1])
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         if got != wanted:
             raise ValueError(

@@ -24,6 +24,7 @@ from softmpm import Model
 from softmpm_learn.distributed import Group
 from softmpm_learn.learning.phase import learn_side_by_side
 from softmpm_learn.loggers import Loggers
+from softmpm_learn.modes import plain_torch
 from softmpm_learn.runs.resuming import entered, resume
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
@@ -113,8 +114,8 @@ def train(
     Raises:
         softmpm_learn.training.optimisation.TrainingError: A simulation or a gradient failed, in whichever process; names the iteration.
         softmpm_learn.distributed.OtherProcessError: The first process cannot go on, and says why.
-        ValueError: Settings that do not go together, or with the checkpoint; a file in ``out`` that is a link, damaged or of another
-            run.
+        ValueError: A model of another scene; settings that do not go together, or with the checkpoint; a file in ``out`` that is a
+            link, damaged or of another run.
         softmpm_learn.storage.checkpoint.CheckpointError: Every checkpoint in ``out`` is damaged.
         softmpm_learn.storage.checkpoint.LockedError: Another run writes to ``out``.
     """
@@ -126,6 +127,7 @@ def train(
     return result
 
 
+@plain_torch()
 def train_side_by_side(
     task: Task,
     model: Model,

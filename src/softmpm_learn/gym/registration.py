@@ -53,12 +53,18 @@ def make(name: str, **settings: Any) -> SoftRobotEnv:
         settings: ``render_mode``, fields of :class:`EnvConf` and of the task's own settings, such as ``seconds=0.5``; ``resolution``
             may be a string.
     """
-    return cast(SoftRobotEnv, gymnasium.make(_own(name), disable_env_checker=True, **settings).unwrapped)
+    there = _own(name)
+    need_known(
+        name, settings, "render_mode"
+    )  # gymnasium.make takes words of its own, whose wrappers are not there
+    return cast(SoftRobotEnv, gymnasium.make(there, disable_env_checker=True, **settings).unwrapped)
 
 
 def make_vec(name: str, num_envs: int = 1, **settings: Any) -> SoftRobotVectorEnv:
     """Environment of ``num_envs`` worlds of a task; settings as of :func:`make`, and ``autoreset_mode``."""
-    return cast(SoftRobotVectorEnv, gymnasium.make_vec(_own(name), num_envs=num_envs, **settings))
+    there = _own(name)
+    need_known(name, settings, "render_mode", "autoreset_mode")
+    return cast(SoftRobotVectorEnv, gymnasium.make_vec(there, num_envs=num_envs, **settings))
 
 
 def make_single(task: str, render_mode: str | None = None, **settings: Any) -> SoftRobotEnv:
@@ -85,16 +91,29 @@ def parts(name: str, settings: dict[str, Any]) -> tuple[Task, EnvConf]:
         ValueError: A keyword is a setting of neither, or there is no such resolution.
     """
     kind: Any = TASKS[name].kind
-    own = [field.name for field in dataclasses.fields(EnvConf)]
-    theirs = [field.name for field in dataclasses.fields(kind) if field.name != "name"]
-    unknown = [key for key in settings if key not in (*own, *theirs)]
-    if unknown:
-        raise ValueError(
-            f"there is no setting {unknown[0]}; known are render_mode, {', '.join([*own, *theirs])}."
-        )
+    own, theirs = need_known(name, settings)
     chosen = {key: value for key, value in settings.items() if key in theirs}
     if isinstance(chosen.get("resolution"), str):
         one_of("resolution", chosen["resolution"], tuple(Resolution.__members__))
         chosen["resolution"] = Resolution[chosen["resolution"]]
     conf = EnvConf(**{key: value for key, value in settings.items() if key in own})
     return make_task(kind(**chosen)), conf
+
+
+def need_known(name: str, settings: dict[str, Any], *others: str) -> tuple[list[str], list[str]]:
+    """Names of the settings of environments and of a task.
+
+    Args:
+        others: Further words that are known.
+
+    Raises:
+        ValueError: A word is none of them.
+    """
+    kind: Any = TASKS[name].kind
+    own = [field.name for field in dataclasses.fields(EnvConf)]
+    theirs = [field.name for field in dataclasses.fields(kind) if field.name != "name"]
+    unknown = [key for key in settings if key not in (*own, *theirs, *others)]
+    if unknown:
+        known = ", ".join([*(others or ["render_mode"]), *own, *theirs])
+        raise ValueError(f"there is no setting {unknown[0]}; known are {known}.")
+    return own, theirs

@@ -22,6 +22,11 @@ class StableBaselinesVecEnv(VecEnv):
     """
 
     def __init__(self, env: SoftRobotVectorEnv):
+        if not isinstance(env, SoftRobotVectorEnv):
+            raise TypeError(
+                f"StableBaselinesVecEnv takes the environment of make_vec itself, got {type(env).__name__}; wrap the adapter, as in "
+                "VecMonitor(StableBaselinesVecEnv(env))."
+            )
         if env.mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
                 f"Stable-Baselines3 needs autoreset_mode='SameStep', got {env.mode.value!r}; give it to make_vec."

@@ -78,6 +78,8 @@ class SoftRobotVectorEnv(VectorEnv):
         count = self.num_envs
         seeds: Any = [None] * count if seed is None else seed
         seeds = [seeds + k for k in range(count)] if isinstance(seeds, Integral) else list(seeds)
+        if seeds and seeds[0] is not None:
+            super().reset(seed=seeds[0])  # np_random, which wrappers draw from
         if len(seeds) != count:
             raise ValueError(f"seed must be one number or {count}, got {len(seeds)}.")
         if not self._generators:

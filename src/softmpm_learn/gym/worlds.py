@@ -18,7 +18,9 @@ import softmpm
 from softmpm import Failures, Inputs, Model, Params, State, UnstableError
 from softmpm_learn.gym.motions import Motions, Step
 from softmpm_learn.gym.rewards import REWARDS, Costs, check_sums
+from softmpm_learn.modes import plain_operations
 from softmpm_learn.observe import Centroids, Observer
+from softmpm_learn.observer_check import check_observer
 from softmpm_learn.setting_checks import lengths
 from softmpm_learn.tasks import Task
 
@@ -95,6 +97,8 @@ class Worlds:
         state: State after the last step, that of :func:`softmpm.contact_forces`; ``shown`` has the particles after a reset too.
     """
 
+    @torch.inference_mode(False)  # in which all that is made could have no gradient later
+    @plain_operations()
     def __init__(self, task: Task, count: int, conf: EnvConf):
         self.task, self.count, self.conf = task, count, conf
         dtype = torch.float64 if conf.dtype == "float64" else torch.float32
@@ -112,6 +116,7 @@ class Worlds:
         self.params = Params(*(value.detach().to(place) for value in params))
         self.inputs = Inputs(**{k: v.detach().to(place) for k, v in inputs.items() if v is not None})
         self.observer = (conf.observer or centroids)(task, self.model)
+        check_observer(self.observer, self.model)
         self._spread = self._tensor(self._checked_spread())
         self._centre = self._tensor([] if task.goal is None else task.goal)
         self.goal = self._centre.expand(count, -1).clone() if len(self._spread) else None
@@ -137,6 +142,7 @@ class Worlds:
     def _tensor(self, values: Any) -> Tensor:
         return torch.as_tensor(np.asarray(values), device=self.model.device).to(self.model.dtype)
 
+    @torch.inference_mode(False)
     def begin(self, worlds: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes.
 
@@ -172,12 +178,8 @@ class Worlds:
 
     def observe(self) -> Tensor:
         """Features and, if it is drawn at random, the goal in [-1, 1] along each axis of its box; shape (world, size)."""
-        features, wanted = self.observer(self.model, self.shown), (self.count, self.observer.size)
-        if features.shape != wanted:
-            raise ValueError(
-                f"the observer must return features of shape (world, size) = {wanted}, got {tuple(features.shape)}; size is an "
-                f"attribute of {type(self.observer).__name__}."
-            )
+        with plain_operations():
+            features = self.observer(self.model, self.shown)
         if self.goal is None:
             return features
         inverse = torch.where(self._spread > 0, 1 / self._spread, 0.0)
@@ -194,6 +196,7 @@ class Worlds:
         x, v, C, F = (select(mask, one, two) for one, two in zip(first[:4], now[:4], strict=True))
         return State(x, v, C, F)
 
+    @plain_operations()
     def step(self, activation: Tensor, moving: np.ndarray | None = None) -> Outcome:
         """One control step.
 
@@ -202,6 +205,7 @@ class Worlds:
             moving: Worlds that take part, shape (world,); the others have just begun and stay as they are, with a reward of 0.
         """
         moving = np.ones(self.count, dtype=bool) if moving is None else moving
+        activation = select(self._mask(moving), activation, torch.zeros_like(activation))
         before = self.shown
         failures = self._simulate(activation, moving) if moving.any() else {}
         failed = np.array([world in failures for world in range(self.count)])

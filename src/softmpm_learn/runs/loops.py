@@ -205,13 +205,22 @@ class ClosedLoop:
             episode.loss.unflatten(0, (self.runs, -1)).mean(dim=1).sum()
         )  # a run's parameters see its own worlds
         # An objective that ends before the episode does not see the last activations:
-        adj = torch.autograd.grad(loss, [*activations, *self.free], materialize_grads=True)
-        adj_activations, adj_free = adj[: len(activations)], adj[len(activations) :]
+        if not loss.requires_grad:
+            raise ValueError(
+                "the objective has no gradient with respect to policy and design: compute its terms with operations of PyTorch from "
+                "what path has, without detach(), and let a parameter of the policy have requires_grad."
+            )
+        acting = activations if activations[0].requires_grad else []  # none of a policy without parameters
+        adj = torch.autograd.grad(loss, [*acting, *self.free], materialize_grads=True)
+        adj_activations, adj_free = adj[: len(acting)], adj[len(acting) :]
         gradients = (*self._policy_gradient(episode.decisions, adj_activations), *adj_free)
         return episode.detach(), gradients, frames
 
     def _policy_gradient(self, decisions: Decisions, adj_activations: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Of all decisions at once: layer by layer and step by step it would be many small sums."""
+        if not adj_activations:
+            return tuple(torch.zeros_like(weight) for weight in self.weights)
         features, times = torch.stack(decisions.features).detach(), times_of(self.task, self.model)[:, None]
         again = self.policy(features, times, self._goal)
-        return torch.autograd.grad(again, self.weights, torch.stack(list(adj_activations)))
+        adj = torch.stack(list(adj_activations))
+        return torch.autograd.grad(again, self.weights, adj, materialize_grads=True)

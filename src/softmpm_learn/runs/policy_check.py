@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from softmpm_learn.seeding import seeded
+
 AGAIN, AT_ONCE = 1e3, 1e5
 """Largest differences of a policy's answers, relative to the largest number, in units of the precision: of the same evaluation again,
 and of one of all control steps from one after another, where convolutions in float32 have ten bits on a GPU (TF32)."""
@@ -35,7 +37,7 @@ def check_policy(
     def in_turn() -> Tensor:
         return torch.stack([policy(features, time, goal) for features, time in zip(z, times, strict=True)])
 
-    with torch.random.fork_rng([z.device] if z.is_cuda else []):
+    with seeded(0, z.device):
         answers = in_turn(), in_turn(), policy(z, times[:, None], goal)
     first, at_once = answers[0], answers[2]
     if at_once.shape != first.shape:

@@ -14,9 +14,10 @@ import softmpm
 from softmpm import Model
 from softmpm_learn.design import Design, declared_inputs
 from softmpm_learn.distributed import Group
-from softmpm_learn.episode import times_of
+from softmpm_learn.episode import need_model_of, times_of
 from softmpm_learn.learning.learner import Learner, make_learner
 from softmpm_learn.observe import Latent, Observer, make_observer
+from softmpm_learn.observer_check import check_observer
 from softmpm_learn.optimizers import make_optimizer
 from softmpm_learn.policy import make_policy
 from softmpm_learn.recovery import settling
@@ -71,6 +72,7 @@ class Run:
             raise ValueError(
                 f"train.worlds is {settings.train.worlds}{share}, but the model was built with {model.worlds}."
             )
+        need_model_of(task, model)
         self.task, self.model, self.settings, self.out = task, model, settings, out
         self.learner: Learner | None = None
         self.observer = self._make_observer()
@@ -116,7 +118,9 @@ class Run:
         with seeded(stream_seed(self.settings.train.seed, "autoencoder")):
             observer = make_observer(self.settings.observer, self.model, task)
         if not isinstance(observer, Latent):
-            return observer.to(self.model.device, self.model.dtype)
+            observer = observer.to(self.model.device, self.model.dtype)
+            check_observer(observer, self.model)
+            return observer
         self.learner = make_learner(self.settings, observer, task.control_steps, self.model, folder)
         observer.encoder = self.learner.encoder
         return observer
@@ -124,7 +128,7 @@ class Run:
     @property
     def parameters(self) -> list[nn.Parameter]:
         """Parameters that the gradient updates: policy, then design."""
-        return [*self.policy.parameters(), *self.design.parameters()]
+        return [p for part in (self.policy, self.design) for p in part.parameters() if p.requires_grad]
 
     @property
     def now(self) -> str:

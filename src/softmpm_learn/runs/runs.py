@@ -60,7 +60,9 @@ class Runs:
             self.observer,
             self.policy,
             self.design,
-            self._together[1].weights if self._together else list(first.policy.parameters()),
+            self._together[1].weights
+            if self._together
+            else [p for p in first.policy.parameters() if p.requires_grad],
             [p for run in runs for p in run.design.parameters()],
             runs=len(runs),
             keep_every=first.settings.learning.frame_every if any(run.learner for run in runs) else 0,

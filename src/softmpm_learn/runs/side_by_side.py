@@ -16,15 +16,14 @@ from torch.nn import functional
 
 from softmpm import Inputs, Model, Params, State
 from softmpm_learn.design import Design
+from softmpm_learn.likeness import alike
 from softmpm_learn.observe import Latent, Observer
-from softmpm_learn.runs.likeness import alike
+from softmpm_learn.observer_check import probe
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.stacking import Stacked
 
 ROUNDING = {torch.float32: 1e-5, torch.float64: 1e-12}
 """Largest difference of two equal observations, relative to the largest value: a GPU adds up the particles at a node in any order."""
-DENT = 0.1
-"""Largest share of the way to a corner by which the robots of a :func:`probe` are displaced: no particle turns inside out."""
 
 
 class Kinds:
@@ -228,26 +227,6 @@ class _Encoder(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.observer.encode(observation)
-
-
-def probe(model: Model) -> State:
-    """A smooth state in which robots are displaced, deformed and moving, in each world differently. A robot stays in its box at rest:
-    its points X move towards the lowest corner of the box, by a share of the way of up to :data:`DENT`.
-    """
-    rest = model.rest()
-    place = {"dtype": model.dtype, "device": model.device}
-    away = rest.x - model.positions.amin(dim=0)
-    wave = torch.arange(1.0, model.dim + 1, **place) / away.max()  # [1/m]
-    phase = away @ wave + torch.arange(model.worlds, **place)[:, None]
-    share = 1 - DENT * (1 + phase.sin()) / 2
-    slope = -DENT / 2 * phase.cos()[..., None] * wave  # of the share, along each axis
-    phases = phase[..., None] + torch.arange(model.dim, **place)
-    return rest._replace(
-        x=rest.x + (share - 1)[..., None] * away,
-        v=phases.sin(),
-        C=phases.cos()[..., None] * wave,
-        F=share[..., None, None] * rest.F + away[..., None] * slope[..., None, :],
-    )
 
 
 @torch.no_grad()

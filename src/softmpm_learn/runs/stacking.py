@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from softmpm_learn.runs.likeness import alike
+from softmpm_learn.likeness import alike
 
 logger = logging.getLogger("softmpm_learn")
 
@@ -51,15 +51,15 @@ class Stacked:
     def weights(self) -> list[Tensor]:
         """Parameters with respect to which a gradient is taken; :meth:`split` gives each module its part."""
         if not self.batched:
-            return [p for module in self.modules for p in module.parameters()]
-        return [self._stacks[name] for name, _ in self.modules[0].named_parameters()]
+            return [p for module in self.modules for p in module.parameters() if p.requires_grad]
+        return [self._stacks[name] for name, p in self.modules[0].named_parameters() if p.requires_grad]
 
     def split(self, gradients: Sequence[Tensor]) -> list[list[Tensor]]:
         """Gradients with respect to the parameters of each module, from those with respect to :attr:`weights`."""
         if self.batched:
             return [[gradient[k] for gradient in gradients] for k in range(len(self.modules))]
         parts = iter(gradients)
-        return [[next(parts) for _ in module.parameters()] for module in self.modules]
+        return [[next(parts) for p in module.parameters() if p.requires_grad] for module in self.modules]
 
     def attach(self) -> None:
         """Take over the values of weights that were replaced instead of changed in place, and make them views again."""

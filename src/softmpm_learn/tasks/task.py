@@ -13,7 +13,7 @@ import torch
 import softmpm
 from softmpm_learn.lasting import Lasting
 from softmpm_learn.objective import Objective
-from softmpm_learn.setting_checks import not_negative, one_of, positive, replaces_nothing, typed
+from softmpm_learn.setting_checks import not_negative, one_of, particles, positive, replaces_nothing, typed
 from softmpm_learn.term import Path
 
 FORMULATIONS = ("moving", "reference")
@@ -213,6 +213,10 @@ class Task:
     """File of the robot, None if it is made by code."""
 
     def __post_init__(self):
+        for name, region in self.regions.items():
+            particles(f"task region {name}", region)
+        if not (math.isfinite(self.body_length) and self.body_length > 0):
+            raise ValueError(f"task body_length must be > 0 m, got {self.body_length}.")
         path = Path([k * self.control_period for k in range(self.control_steps + 1)], [], torch.empty(0))
         for term in self.objective.terms:
             term.window(path)  # raises if no state of the episode lies in it

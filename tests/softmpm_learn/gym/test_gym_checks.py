@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from softmpm_learn.gym import EnvConf, SoftRobotEnv, make
+from softmpm_learn.gym import EnvConf, SoftRobotEnv, make, make_vec
 from softmpm_learn.objective import Effort, Objective, Path, Progress, Term
 from softmpm_learn.observe import Observer
 from softmpm_learn.tasks import ArmConf, make_task
@@ -117,7 +117,7 @@ def test_a_body_is_material_and_inputs():
 
 
 def test_an_observer_of_another_size():
-    """An observation that is not in the observation space is refused at the first reset."""
+    """What is not in the observation space is refused when the environment is made."""
 
     class Place(Observer):
         size = 3
@@ -128,6 +128,58 @@ def test_an_observer_of_another_size():
         def encode(self, observation):
             return observation
 
-    env = make("arm", observer=lambda task, model: Place(), **SHORT)
     with pytest.raises(ValueError, match=r"features of shape \(world, size\) = \(1, 3\), got \(1, 2\)"):
-        env.reset()
+        make("arm", observer=lambda task, model: Place(), **SHORT)
+
+
+@pytest.mark.parametrize(
+    "word", [dict(max_episode_steps=3), dict(disable_env_checker=True), dict(vectorization_mode="sync")]
+)
+def test_words_of_gymnasium_are_not_ours(word):
+    """Its wrappers would be taken off again, so that the word would do nothing."""
+    for build in (make, make_vec):
+        with pytest.raises(
+            ValueError, match=f"there is no setting {next(iter(word))}; known are render_mode"
+        ):
+            build("arm", **SHORT, **word)
+
+
+def test_the_seed_of_a_vector_is_that_of_its_wrappers():
+    """They draw from np_random, as of a single environment."""
+    env, drawn = make_vec("arm", 2, **SHORT), []
+    for seed in (0, 0, [0, 7]):
+        env.reset(seed=seed)
+        drawn.append(env.np_random.uniform())
+    assert drawn == [np.random.default_rng(0).uniform()] * 3 and env.np_random_seed == 0
+    env.reset()
+    assert env.np_random.uniform() != drawn[0]
+
+
+def test_an_ignored_action_may_be_anything():
+    """In the step after an episode a world ignores its action: the others go on."""
+    env = make_vec("arm", 2, **(SHORT | dict(seconds=0.05)), autoreset_mode="NextStep")
+    env.reset(seed=0)
+    actions, ended = np.zeros((2, env.single_action_space.shape[0])), np.array([True, False])
+    env.step(actions)
+    env.terminated = ended
+    actions[0] = np.nan
+    _, reward, *_ = env.step(actions)
+    assert reward[0] == 0 and np.isfinite(reward).all()
+
+
+def test_modes_of_the_caller_are_not_those_of_an_environment():
+    """Observations are as without autocast; one that was made in inference mode has gradients later."""
+    plain = make("arm", **SHORT)
+    with torch.inference_mode():
+        env = make("arm", **SHORT)
+        env.reset(seed=0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = [one.step(np.full(one.action_space.shape, 0.3)) for one in (env, plain) if one.reset(seed=0)]
+        env.reset(seed=0)
+        action = torch.full(env.action_space.shape, 0.3, requires_grad=True)
+        observation, reward = env.step_torch(action)
+    plain.reset(seed=0)
+    want = plain.step(np.full(plain.action_space.shape, 0.3))[0]
+    assert all(np.array_equal(one[0], want) for one in found)
+    np.testing.assert_allclose(observation.detach().numpy(), want, rtol=1e-6)
+    assert torch.autograd.grad(reward, action)[0].isfinite().all()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from softmpm_learn.gym import make, make_vec
 from softmpm_learn.gym.stable_baselines import StableBaselinesVecEnv
@@ -49,3 +50,10 @@ def test_both_libraries_train():
     assert len(found) == 2 * steps // 4 and np.isfinite(found).all() and np.ptp(found) > 0
     found = train_skrl(minutes=1.0, steps=steps, worlds=2, **SHORT)
     assert len(found) == 2 * steps // 5 and np.isfinite(found).all() and np.ptp(found) > 0
+
+
+def test_the_adapter_takes_no_wrapper():
+    """It reads what a wrapper hides, and wrappers of Stable-Baselines3 go around it."""
+    wrapped = RecordEpisodeStatistics(make_vec("arm", 2, autoreset_mode="SameStep", **SHORT))
+    with pytest.raises(TypeError, match=r"got RecordEpisodeStatistics; wrap the adapter, as in VecMonitor\("):
+        StableBaselinesVecEnv(wrapped)

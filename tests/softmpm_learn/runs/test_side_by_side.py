@@ -21,10 +21,10 @@ from softmpm_learn import register
 from softmpm_learn.command.seeds import split
 from softmpm_learn.episode import run_episode
 from softmpm_learn.observe import Observer, VelocityImage
+from softmpm_learn.observer_check import probe
 from softmpm_learn.runs.loops import ClosedLoop
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
-from softmpm_learn.runs.side_by_side import probe
 from softmpm_learn.settings import Settings, TrainConf
 from softmpm_learn.storage import checkpoint
 from softmpm_learn.train import Plan, Result, train, train_side_by_side

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from softmpm_learn.runs.likeness import alike
+from softmpm_learn.likeness import alike
 
 
 class Plain:
