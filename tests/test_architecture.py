@@ -13,7 +13,7 @@ import softmpm
 
 SRC = Path(__file__).parents[1] / "src"
 LAYERS = """
-    validate summary devices batches compiling workspace kernels.compile
+    validate summary draft devices batches compiling workspace kernels.compile
     state inputs kernels.parts kernels.dependent
     errors
     scene planning alarms kernels.structs

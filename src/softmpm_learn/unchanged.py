@@ -1,4 +1,4 @@
-"""Checks that what several readers share stays as it is: an operation in place would change what the next one reads, and the simulation."""
+"""Checks that what several readers share stays as it is: a change in place would reach the next reader, and the simulation."""
 
 from collections.abc import Iterable, Sequence
 

@@ -151,7 +151,7 @@ def _own(colour: Tensor | np.ndarray, worlds: tuple[int, ...], count: int) -> li
 def longest(instants: Sequence[Instant]) -> float:
     """Traction at the top of its scale [Pa]; 0 without any."""
     sizes = (np.linalg.norm(one.traction.sum(0), axis=-1) for one in instants if one.traction is not None)
-    return max((float(size.max(initial=0.0)) for size in sizes), default=0.0)
+    return max((float(size[np.isfinite(size)].max(initial=0.0)) for size in sizes), default=0.0)
 
 
 def panels_of(
@@ -177,38 +177,49 @@ def panels_of(
             self.savefig(png, format="png", dpi=110)
             return png.getvalue()
 
-    if axes is None:
-        corners = (low, high) if place.dim == 2 else Camera(low, high, place.up).frame(low, high)
-        width, height = corners[1] - corners[0]
-        rows, columns = _grid(count, float(height / width))
-        size = _size(float(rows * height), float(columns * width), rows, columns, not colouring.names)
-        room = size[1]
-        figure = Picture(figsize=size, layout="constrained", facecolor="white")
-        axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
-        for spare in axes[count:]:
-            spare.set_axis_off()
-        axes = axes[:count]
-        lowest = axes[-columns:]
-    else:
-        axes = np.ravel(np.asarray(axes, dtype=object))
-        if len(axes) != count:
-            raise ValueError(f"axes must be one for each world, {count}, got {len(axes)}.")
-        figure = axes[0].get_figure()
-        size, room = None, axes[-1].get_window_extent().height / figure.dpi
-        lowest = axes[:0]
-    panels = [Panel(one, place, low, high, traction, colouring.with_fibres) for one in axes]
-    if traction > 0.0:
-        panels[0].draw_scale("traction" if count == 1 else "")  # beside the name of a world
-    if place.dim == 2 and count > 1:
-        for one in axes:
-            one.label_outer()
-        for one in lowest:  # also above an empty place
-            one.tick_params(labelbottom=True)
-            one.set_xlabel("x [m]")
-    key = _key(figure, list(axes), colouring, room)
-    if size is not None and key is not None:
-        _widen(figure, key, size[0] - NAMES)
+    with _on_white(axes is None):
+        if axes is None:
+            corners = (low, high) if place.dim == 2 else Camera(low, high, place.up).frame(low, high)
+            width, height = corners[1] - corners[0]
+            rows, columns = _grid(count, float(height / width))
+            size = _size(float(rows * height), float(columns * width), rows, columns, not colouring.names)
+            room = size[1]
+            figure = Picture(figsize=size, layout="constrained", facecolor="white")
+            axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+            for spare in axes[count:]:
+                spare.set_axis_off()
+            axes = axes[:count]
+            lowest = axes[-columns:]
+        else:
+            axes = np.ravel(np.asarray(axes, dtype=object))
+            if len(axes) != count:
+                raise ValueError(f"axes must be one for each world, {count}, got {len(axes)}.")
+            figure = axes[0].get_figure()
+            size, room = None, axes[-1].get_window_extent().height / figure.dpi
+            lowest = axes[:0]
+        panels = [Panel(one, place, low, high, traction, colouring.with_fibres) for one in axes]
+        if traction > 0.0:
+            panels[0].draw_scale("traction" if count == 1 else "")  # beside the name of a world
+        if place.dim == 2 and count > 1:
+            for one in axes:
+                one.label_outer()
+            for one in lowest:  # also above an empty place
+                one.tick_params(labelbottom=True)
+                one.set_xlabel("x [m]")
+        key = _key(figure, list(axes), colouring, room)
+        if size is not None and key is not None:
+            _widen(figure, key, size[0] - NAMES)
     return figure, panels
+
+
+def _on_white(own: bool) -> Any:
+    """The look of a figure of our own inside, dark letters on white, whatever style is chosen; of given axes that of their figure."""
+    from matplotlib import rc_context
+
+    dark = "text.color", "axes.labelcolor", "axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color"
+    look: dict[Any, Any] = {**dict.fromkeys(dark, "black"), "axes.grid": False, "lines.linestyle": "-"}
+    look |= {"xtick.labelcolor": "inherit", "ytick.labelcolor": "inherit"}
+    return rc_context(look if own else {})
 
 
 def _grid(count: int, ratio: float) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """to_video: a recording, or the states of a simulation, as a GIF or an MP4."""
 
 import itertools
-import os
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from softmpm.check_state import check_state
+from softmpm.draft import draft
 from softmpm.model import Model, check_model
 from softmpm.pictures.colouring import QUANTITIES, coloured, values_of
 from softmpm.pictures.figure import longest, panels_of
@@ -24,6 +25,7 @@ DPI = 100
 MOST_OF_A_GIF = 50
 """Pictures per second: viewers slow down shorter ones than two hundredths of a second."""
 
+FAILED = "ffmpeg could not write the film, perhaps for want of room on the disk"
 EXACT = 128
 """Colours of a picture of a GIF that are exact, of 256; the others are covered by the rest."""
 
@@ -68,7 +70,8 @@ def to_video(
     Raises:
         ImportError: matplotlib, or the package that writes an MP4, is not installed; the message names it.
         TypeError, ValueError: An argument has another type or value, or there is nothing to show.
-        FileNotFoundError, OSError: The recording cannot be read; see :class:`softmpm.Recording`.
+        FileNotFoundError, OSError: The recording cannot be read, see :class:`softmpm.Recording`, or the film not be written; then an
+            older one is as it was.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
@@ -82,6 +85,11 @@ def to_video(
         )
     if colour is not None and colour not in QUANTITIES:
         raise ValueError(f"colour must be one of {', '.join(QUANTITIES)}, got {colour!r}.")
+    if isinstance(source, (str, Path, Recording)):
+        given = dict(model=model, activation=activation, period=period, world=world or None)
+        foreign = [name for name, value in given.items() if value is not None]
+        if foreign:
+            raise ValueError(f"{foreign[0]} belongs to a film of states; a recording has its own.")
     if isinstance(source, str | Path):
         with Recording(source) as recording:
             place, instants = _of_recording(recording, iteration, fps, rate)
@@ -89,12 +97,8 @@ def to_video(
         place, instants = _of_recording(source, iteration, fps, rate)
     else:
         place, instants = _of_states(_listed(source), model, activation, world, period, fps, rate)
-    draft = path.with_name(f"{path.stem}.new{path.suffix}")
-    try:
-        WRITERS[path.suffix.lower()](draft, _pictures(place, instants, colour, limits), fps)
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with draft(path) as film:
+        WRITERS[path.suffix.lower()](film, _pictures(place, instants, colour, limits), fps)
     return path
 
 
@@ -108,6 +112,10 @@ def _of_recording(
     if len(rows) == 0:
         raise ValueError(f"{recording.path} has no frames of iteration {iteration} to show.")
     time = recording.read("time", rows)[1]
+    if time[-1] < time[0]:
+        raise ValueError(
+            f"the times of the frames must not fall, got {time[0]:g} s first and {time[-1]:g} s last in {recording.path}."
+        )
     chosen = resampled(time, fps, rate)
     found = dict(zip(np.unique(chosen), recorded(recording, rows[np.unique(chosen)]), strict=True))
     return of_recording(recording), _filled([found[k] for k in chosen])
@@ -183,9 +191,14 @@ def _pictures(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure.set_dpi(DPI)
+    times = [instant.time for instant in instants if instant.time is not None]
+    span = max(times, default=0.0) - min(times, default=0.0)
+    digits = max(2, 2 - math.floor(math.log10(span))) if span > 0 else 2
     canvas = FigureCanvasAgg(figure)
     for instant, one in zip(instants, values, strict=True):
-        panel.draw(instant, colouring.rgb(one), "" if instant.time is None else f"{instant.time:.2f} s")
+        panel.draw(
+            instant, colouring.rgb(one), "" if instant.time is None else f"{instant.time:.{digits}f} s"
+        )
         if figure.get_layout_engine() is not None:  # the first picture decides the layout, see show
             figure.draw_without_rendering()
             figure.draw_without_rendering()
@@ -229,7 +242,7 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
         raise ImportError(
             'an MP4 needs the package imageio-ffmpeg: pip install "softmpm[video]". A .gif needs no further package.'
         ) from error
-    writer = None
+    writer, sent = None, 0
     try:
         for picture in pictures:
             if writer is None:
@@ -239,9 +252,25 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
                 )
                 writer.send(None)
             writer.send(np.ascontiguousarray(picture))
+            sent += 1
+    except BrokenPipeError as error:
+        raise OSError(f"{FAILED}, of which {sent} pictures were sent.") from error
     finally:
         if writer is not None:
             writer.close()
+    _need_whole(path, sent)
+
+
+def _need_whole(path: Path, sent: int) -> None:
+    """Raise OSError unless a film has all pictures: where the disk is full, ffmpeg may end without an error."""
+    import imageio_ffmpeg
+
+    try:
+        written = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+    except RuntimeError:
+        written = 0
+    if written != sent:
+        raise OSError(f"{FAILED}: it has {written} of {sent} pictures.")
 
 
 WRITERS: dict[str, Callable[[Path, Iterable[np.ndarray], int], None]] = {

@@ -41,7 +41,9 @@ class Panel:
         traction: float,
         with_fibres: bool = False,
     ):
-        self._axes, self._place, self._traction = axes, place, traction
+        from matplotlib import rcParams
+
+        self._axes, self._place, self._traction, self._ink = axes, place, traction, rcParams["text.color"]
         gap = max(place.spacing, float((high - low).max()) / STROKES)
         self._fibres = Fibres(place, gap) if with_fibres else None
         self._moving: list[Any] = []
@@ -83,7 +85,7 @@ class Panel:
         if instant.places is not None:
             self._draw_points(instant.places, instant.traction)
         if title:
-            self._axes.set_title(title, fontsize=9, loc="left")
+            self._axes.set_title(title, fontsize=9, loc="left", color=self._ink)
 
     def _with_strokes(
         self, strokes: Fibres, x: np.ndarray, radii: np.ndarray, rgb: np.ndarray, edge: np.ndarray

@@ -65,6 +65,7 @@ class Recording:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
+        self._place = self.path.absolute()  # also where a program has changed its folder since
         if not self.path.is_file():
             raise FileNotFoundError(f"there is no recording {self.path}.")
         self._steadily(self._load)
@@ -89,25 +90,26 @@ class Recording:
 
         One that has not changed it for a while may only wait for a processor, so the failure is final after :data:`_PATIENCE` pauses.
         """
-        changes, pauses, before = 0, 0, self._stamp()
+        changes, pauses, before = 0, 0, None
         while True:
             try:
                 return read()
             except (OSError, ValueError):
-                if changes == _ATTEMPTS or pauses == _PATIENCE:
+                if changes == _ATTEMPTS or pauses == _PATIENCE or not self._place.exists():
                     raise
+                before = before or self._stamp()
                 time.sleep(_PAUSE)
                 now = self._stamp()
                 changes, pauses = (changes, pauses + 1) if now == before else (changes + 1, 0)
                 before = now
 
     def _stamp(self) -> tuple[int, ...]:
-        found = os.stat(self.path)
+        found = os.stat(self._place)
         return found.st_mtime_ns, found.st_size, found.st_ino
 
     def _load(self) -> None:
         try:
-            self._file = h5py.File(readable(self.path), "r", locking="best-effort")
+            self._file = h5py.File(readable(self._place), "r", locking="best-effort")
         except (*_DAMAGE, ValueError) as error:
             raise OSError(f"{self.path} is not a readable recording: {error}.") from error
         try:
@@ -232,6 +234,9 @@ class Recording:
         return out
 
     def _one_row(self, table: str, row: int) -> np.ndarray:
+        if not self._file:
+            raise ValueError(f"{self.path}: this recording is closed.")
+
         def read() -> np.ndarray:
             try:
                 return self._tables[table][row]

@@ -6,13 +6,14 @@ simulations stands on ``time`` at the same fraction of the way between them, so 
 robots play.
 """
 
-import os
+import contextlib
 import warnings
 from pathlib import Path
 
 import numpy as np
 
 from softmpm.checks import check_whole
+from softmpm.draft import draft
 from softmpm.recording import style
 from softmpm.recording.fibres import DARK, STROKES, Fibres
 from softmpm.recording.reader import Recording
@@ -20,6 +21,8 @@ from softmpm.recording.rerun_blueprint import blueprint, curve
 from softmpm.recording.selection import Show, Simulation, plan
 from softmpm.recording.surroundings import of_recording
 
+_FOOTER = 12, b"RRF2FOOT"
+"""Length of the end of a Rerun file, and what is in it, in the format RRF2 of rerun-sdk 0.41."""
 _BLOCK_BYTES = 2**26  # of positions converted at a time
 
 
@@ -43,7 +46,8 @@ def to_rerun(
 
     Raises:
         ImportError: rerun is not installed. The recording can be converted later.
-        FileNotFoundError, OSError, ValueError: The recording cannot be read; see :class:`softmpm.Recording`.
+        FileNotFoundError, OSError, ValueError: The recording cannot be read, see :class:`softmpm.Recording`, or the Rerun file not be
+            written; then an older one is as it was.
     """
     try:
         import rerun as rr
@@ -61,21 +65,33 @@ def to_rerun(
         raise ValueError(
             f"the Rerun file would replace the recording {recording}; give it another name with rrd=."
         )
-    draft = rrd.with_name(f"{rrd.name}.new")
     stream = rr.RecordingStream("softmpm")
-    try:
-        with Recording(recording) as source, warnings.catch_warnings():
-            warnings.simplefilter("error", RerunWarning)  # rerun would warn and leave data out
-            show = plan(source, every, max_particles)
-            stream.save(draft, default_blueprint=blueprint(source, show))
-            _log_all(stream, source, show)
-        stream.flush()
-        stream.disconnect()
-        os.replace(draft, rrd)
-    finally:
-        stream.disconnect()
-        draft.unlink(missing_ok=True)
+    with draft(rrd) as place:
+        try:
+            with Recording(recording) as source, warnings.catch_warnings():
+                warnings.simplefilter("error", RerunWarning)  # rerun would warn and leave data out
+                show = plan(source, every, max_particles)
+                stream.save(place, default_blueprint=blueprint(source, show))
+                _log_all(stream, source, show)
+            stream.flush()
+        except RuntimeError as error:  # Rerun's, where it cannot write
+            raise OSError(f"{rrd} cannot be written: {error}") from error
+        finally:
+            stream.disconnect()
+        _need_whole(place, rrd)
     return rrd
+
+
+def _need_whole(place: Path, rrd: Path) -> None:
+    """Raise OSError unless a Rerun file has its end, without which viewers refuse it: Rerun only logs that the disk was full."""
+    size = place.stat().st_size if place.is_file() else 0
+    with contextlib.suppress(FileNotFoundError), open(place, "rb") as file:
+        file.seek(max(0, size - _FOOTER[0]))
+        if _FOOTER[1] in file.read():
+            return
+    raise OSError(
+        f"{rrd} cannot be written: Rerun left an unfinished file of {size} bytes; is there room on the disk, and is Rerun switched on?"
+    )
 
 
 def _log_all(stream, source: Recording, show: Show) -> None:

@@ -9,6 +9,8 @@ from softmpm.recording.format import PARTS, chosen
 from softmpm.recording.reader import Recording
 
 _SAMPLE = 64  # frames that decide the scales and the framing
+ALONE = 0.04
+"""Time for which a simulation of one frame is on display [s]."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ def _in_sequence(source: Recording, every: int) -> list[Simulation]:
             since = source.read("time", rows)[1]
             at = time + since - since[0]
             simulations.append(Simulation(iteration, rows, frame + np.arange(len(rows)), at))
-            frame, time = frame + len(rows), at[-1] + (at[-1] - at[0]) / max(len(rows) - 1, 1)
+            pause = (at[-1] - at[0]) / (len(rows) - 1) if len(rows) > 1 else ALONE
+            frame, time = frame + len(rows), at[-1] + pause
     return simulations
 
 

@@ -142,9 +142,12 @@ def _drawn(vectors: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def frame_box(low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Part of the grid worth looking at: where the robot was, and some room around it."""
+    """Part of the world worth looking at: where the robot was, and some room around it that is in the grid."""
     room = 0.12 * float((high - low).max())
-    return np.maximum(low - room, -0.02 * upper.max()), np.minimum(high + room, upper * 1.02)
+    return (
+        np.minimum(low, np.maximum(low - room, -0.02 * upper.max())),
+        np.maximum(high, np.minimum(high + room, upper * 1.02)),
+    )
 
 
 def upward(gravity: np.ndarray) -> np.ndarray:

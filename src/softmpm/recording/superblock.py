@@ -15,6 +15,8 @@ _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _LENGTH = 48  # of the superblock with 8-byte addresses
 _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
 _WORD = 0xFFFFFFFF
+_ROOM = 2**48
+"""Size of a recording that is being written, as HDF5 is told: what the writer adds is at places that it may read."""
 
 
 def readable(path: Path) -> "str | Unmarked":
@@ -35,19 +37,22 @@ def readable(path: Path) -> "str | Unmarked":
     if not head[_FLAGS]:
         return str(path)
     new = bytearray(head)
-    new[_FLAGS], new[_END] = 0, struct.pack("<Q", size)  # the writer may have added more than it noted
+    new[_FLAGS], new[_END] = (
+        0,
+        struct.pack("<Q", _ROOM),
+    )  # the writer adds more than it noted, also while the file is read
     new[_CHECKSUM] = _checksum(bytes(new[:44]))
-    return Unmarked(path, bytes(new), size)
+    return Unmarked(path, bytes(new))
 
 
 class Unmarked(io.RawIOBase):
     """A file whose first bytes are replaced, for h5py's driver of Python files.
 
-    Its size remains that which the superblock was given: while a writer reserves disk space the file is longer for a moment.
+    Its size is that of the superblock, more than a file ever has: a read beyond the real end fails by itself.
     """
 
-    def __init__(self, path: Path, head: bytes, size: int):
-        self._file, self._head, self._size = open(path, "rb", buffering=0), head, size  # noqa: SIM115
+    def __init__(self, path: Path, head: bytes):
+        self._file, self._head, self._at = open(path, "rb", buffering=0), head, 0  # noqa: SIM115
 
     def readable(self) -> bool:
         return True
@@ -56,16 +61,16 @@ class Unmarked(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        if whence == os.SEEK_END:
-            return self._file.seek(self._size + offset)
-        return self._file.seek(offset, whence)
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: _ROOM}[whence]
+        return self._at
 
     def tell(self) -> int:
-        return self._file.tell()
+        return self._at
 
     def readinto(self, buffer) -> int:
         """Fill the whole buffer, since HDF5 would take unfilled bytes for data."""
-        view, start, done = memoryview(buffer).cast("B"), self.tell(), 0
+        view, start, done = memoryview(buffer).cast("B"), self._at, 0
+        self._file.seek(start)
         while done < len(view):
             count = self._file.readinto(view[done:])
             if not count:
@@ -73,6 +78,7 @@ class Unmarked(io.RawIOBase):
             done += count
         head = self._head[start : start + len(view)]
         view[: len(head)] = head
+        self._at += len(view)
         return len(view)
 
     def close(self) -> None:

@@ -20,10 +20,12 @@ from softmpm.checks import check_whole
 from softmpm.model import Model
 from softmpm.recording.digest import Content, Hash
 from softmpm.recording.file import begin, need_name, open_to_append, put_in_place, room
-from softmpm.recording.format import EPISODE, FRAME, PARTS, SCALAR, put, static_values, tables
+from softmpm.recording.format import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, put, static_values, tables
 from softmpm.recording.format_checks import check_values
 from softmpm.state import ContactForces, GridField, State
 
+PER_FRAME_TABLES = {f"frame/{name}" for name in PER_FRAME}
+"""Tables of which a frame has the row of its own number."""
 FURTHER_FRAME = 2**16
 """Bytes that HDF5 may need for itself with each further frame that is written together with others: a page for each row of a table."""
 
@@ -53,7 +55,7 @@ class Recorder:
 
     Raises:
         FileExistsError: The file exists, and ``resume_before`` was not given.
-        ValueError: The existing file records another scene, or has another digest.
+        ValueError: The existing file records another scene, or has another digest; ``resume_before`` is no iteration.
         OSError: There is no room on the disk; also from the methods. What was recorded before is safe. From the methods also if
             the file was deleted, or replaced by that of another recorder.
     """
@@ -73,6 +75,8 @@ class Recorder:
         for name, most, least in (("max_particles", max_particles, 1), ("max_points", max_points, 0)):
             if most is not None:
                 check_whole(name, most, least)
+        if resume_before is not None:
+            check_whole("resume_before", resume_before, 0)
         self.path, self.every = Path(path), every
         if resume_before is None and self.path.exists():
             raise FileExistsError(
@@ -99,7 +103,9 @@ class Recorder:
             draft.unlink(missing_ok=True)
         self._file = open_to_append(self.path)
         self._tables = tables(self._file)
-        self._count = {name: len(table) for name, table in self._tables.items()}
+        self._count = {
+            name: len(table) for name, table in self._tables.items() if name not in PER_FRAME_TABLES
+        }
         self._waiting: list[_Waiting] | None = None
 
     @property
@@ -142,7 +148,7 @@ class Recorder:
     def _write_together(self, frames: "list[_Waiting]") -> None:
         """One row in each table for each frame; they count once the last rows, those of ``frame/index``, are written."""
         self._need_open()
-        rows, index = dict[str, list[np.ndarray]](), []
+        rows, index, first = dict[str, list[np.ndarray]](), [], self._count["frame/index"]
         for frame in frames:
             for name, one in frame.values.items():
                 rows.setdefault(f"frame/{name}", []).append(one)
@@ -155,9 +161,12 @@ class Recorder:
         size = sum(one.nbytes for many in rows.values() for one in many)
         with room(self._file, size + (len(frames) - 1) * FURTHER_FRAME):
             for table, many in rows.items():
-                put(self._tables[table], self._count[table], np.stack(many))
+                put(self._tables[table], self._count.get(table, first), np.stack(many))
+                if (
+                    table in self._count
+                ):  # before the index has its row, so that none is named twice after an interrupt
+                    self._count[table] += len(many)
         self._write("frame/index", np.array(index, FRAME))
-        self._count |= {table: self._count[table] + len(many) for table, many in rows.items()}
         for frame in frames:
             Content.frame(frame.episode._content, frame.time, frame.values | frame.parts)
 

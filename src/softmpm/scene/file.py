@@ -10,7 +10,6 @@ constructors that check their values, and nothing is unpickled.
 import io
 import json
 import math
-import os
 import zipfile
 from dataclasses import fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from softmpm.draft import draft
 from softmpm.scene.actuators import Muscle, Pressure
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.outline import Outline
@@ -53,17 +53,12 @@ def save_scene(scene: Scene, path: str | Path) -> None:
         raise TypeError(f"save_scene needs a softmpm.Scene, got {type(scene).__name__}.")
     path, arrays = Path(path), {}
     structure = {"format": FORMAT, "version": VERSION, "scene": _encoded(scene, "", arrays)}
-    draft = path.with_name(f"{path.name}.draft")
-    try:
-        with zipfile.ZipFile(draft, "w") as file:
-            file.writestr(zipfile.ZipInfo(_STRUCTURE, _DATE), json.dumps(structure, indent=1))
-            for name, values in arrays.items():
-                data = io.BytesIO()
-                np.lib.format.write_array(data, values, version=(1, 0), allow_pickle=False)
-                file.writestr(zipfile.ZipInfo(name + _ARRAY, _DATE), data.getvalue())
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with draft(path) as place, zipfile.ZipFile(place, "w") as file:
+        file.writestr(zipfile.ZipInfo(_STRUCTURE, _DATE), json.dumps(structure, indent=1))
+        for name, values in arrays.items():
+            data = io.BytesIO()
+            np.lib.format.write_array(data, values, version=(1, 0), allow_pickle=False)
+            file.writestr(zipfile.ZipInfo(name + _ARRAY, _DATE), data.getvalue())
 
 
 def load_scene(path: str | Path) -> Scene:

@@ -1,5 +1,6 @@
 """Last lines of the log of a run: its outcome, its folder, and the command that shows or continues it."""
 
+import logging
 import math
 import os
 import shutil
@@ -14,6 +15,8 @@ from softmpm_learn.command.pictures import last_episode
 from softmpm_learn.storage import sweep
 from softmpm_learn.tasks import Task
 from softmpm_learn.train import Result
+
+logger = logging.getLogger("softmpm_learn")
 
 
 def farewell(result: Result, task: Task, out: Path) -> str:
@@ -100,6 +103,9 @@ def convert(out: Path) -> str:
     recording, picture = out / "run.h5", out / "run.rrd"
     try:
         softmpm.to_rerun(recording, picture)
+    except OSError as error:
+        logger.warning("The run is whole, but not its Rerun file: %s", error)
+        return f"python -m softmpm {_relative(recording)} && rerun {_relative(picture)} (once there is room)"
     except ImportError:
         return f"python -m softmpm {_relative(recording)} && rerun {_relative(picture)} (with rerun-sdk)"
     return f"rerun {_relative(picture)}" if shutil.which("rerun") else f"python -m rerun {_relative(picture)}"

@@ -105,7 +105,7 @@ def _runs(folder: Path, job: int | None = None) -> Iterator[SweptRun]:
         raise ValueError(
             f"{folder} is no sweep: it has no {sweep.TABLE}. Give the folder of one, such as outputs/sweep/SETTINGS."
         )
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     need = {"job", "status", "settings", "folder"}
     if not rows or not need <= set(rows[0]):
@@ -161,7 +161,7 @@ def _run(folder: Path, job: int, row: dict[str, str], place: Path, seed: int | N
 
 
 def _add_metrics(run: SweptRun, path: Path) -> None:
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         names = list(reader.fieldnames or [])
         if names[:2] != ["iteration", "loss"]:

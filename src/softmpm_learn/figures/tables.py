@@ -104,7 +104,7 @@ def load(path: Path, texts: Sequence[str] = ()) -> list[Row]:
     Args:
         texts: Further columns of words: the settings.
     """
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     words = {*TEXTS, *texts}
     return [

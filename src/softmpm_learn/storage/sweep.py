@@ -119,7 +119,14 @@ def _update_job(folder: Path) -> None:
 def tabulate(sweep: Path) -> None:
     """Write the table of all jobs of the sweep that have an outcome; of a job with several seeds, a row for each of them, unless it
     failed before any of them did: then they have the outcomes of an earlier command, and the job's own takes their place."""
-    known = {path.parent: found for path in sweep.rglob(OUTCOME) if (found := outcome(path.parent))}
+    known = {}
+    for path in sweep.rglob(OUTCOME):
+        at, found = path.parent, outcome(path.parent)
+        inside = at.relative_to(sweep).parts
+        if (
+            found and Path(found.folder).parts[-len(inside) :] == inside
+        ):  # else a copy of another job's folder
+            known[at] = found
     seeds: dict[Path, list[Path]] = {}
     for folder in known:
         if folder.name.startswith(SEED):

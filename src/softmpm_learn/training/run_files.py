@@ -25,6 +25,8 @@ from softmpm_learn.storage.sweep import EXAMINED
 from softmpm_learn.training.timing import TIMING, clock
 
 logger = logging.getLogger("softmpm_learn")
+OF_SWEEPS = "run", "sweep", "job", "seed", "status", "quantity", "term", "folder", "error"
+"""Columns of the tables of :mod:`softmpm_learn.figures` beside those of metrics.csv."""
 
 
 def metrics(run: Run) -> list[str]:
@@ -37,11 +39,11 @@ def metrics(run: Run) -> list[str]:
     others += ["gradient_policy", "gradient_design", "clipped", "retries", "fallbacks", "restarts"]
     others += [f"{name}_change" for name in run.design.change()]
     others += ["epochs", "training_loss", "validation_loss", "replay", *EXAMINED]
-    taken = [name for name in terms if name in ("iteration", "loss", *others)]
+    taken = [name for name in terms if name in ("iteration", "loss", *others, *OF_SWEEPS)]
     if taken:
         raise ValueError(
-            f"the objective has a term {taken[0]!r}, but metrics.csv has another column of that name; give the class of the term "
-            "another name."
+            f"the objective has a term {taken[0]!r}, but metrics.csv or a table of sweeps has another column of that name; give the "
+            "class of the term another name."
         )
     return ["loss", *terms, *others]
 

@@ -422,3 +422,31 @@ def test_pictures_leave_pyplot_alone():
     subprocess.run(
         [sys.executable, "-c", code], check=True, env={"PYTHONPATH": ":".join(sys.path)}, timeout=120
     )
+
+
+def test_a_body_outside_of_the_grid_is_in_the_picture(model):
+    """As in the reference formulation, where it may fall out of it: the axes are upright, and hold all particles."""
+    for shift in ((0.0, -3.0), (5.0, 0.0), (-5.0, 9.0)):
+        state = model.rest()
+        state = state._replace(x=state.x + torch.tensor(shift, dtype=state.x.dtype))
+        axes = softmpm.show(model, state).axes[0]
+        for limits, places in zip((axes.get_xlim(), axes.get_ylim()), state.x[0].T, strict=True):
+            assert limits[0] <= places.min() < places.max() <= limits[1]
+
+
+def test_any_style_leaves_letters_dark(model):
+    """On white panels; axes of the user's own have the colours of their figure."""
+    from matplotlib import rc_context
+    from matplotlib.colors import same_color
+
+    look = {"text.color": "white", "axes.labelcolor": "white", "xtick.color": "white", "ytick.color": "white"}
+    state = model.rest()
+    with rc_context(look):
+        for figure in (softmpm.show(model, state), softmpm.show(model)):
+            letters = [
+                text for text in figure.findobj(lambda one: hasattr(one, "get_text")) if text.get_text()
+            ]
+            assert letters and all(same_color(text.get_color(), "black") for text in letters)
+        own = Figure().subplots()
+        softmpm.show(model, state, axes=own)
+        assert same_color(own.xaxis.label.get_color(), "white")

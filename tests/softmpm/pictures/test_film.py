@@ -1,5 +1,6 @@
 """Films: the files open, have the right pictures at the right times, and errors name the remedy."""
 
+import os
 import sys
 
 import numpy as np
@@ -229,3 +230,64 @@ def test_without_the_package_of_mp4_the_remedy_is_named(model, states, tmp_path,
     with pytest.raises(ImportError, match=r"softmpm\[video\]"):
         softmpm.to_video(states, tmp_path / "a.mp4", model=model)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unfinished_mp4_is_an_error(model, states, tmp_path, monkeypatch):
+    """Such as on a full disk, where ffmpeg may end well; the older film is as it was."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path, real = tmp_path / "old.mp4", ffmpeg.write_frames
+    path.write_bytes(b"an older film")
+
+    def cut(place, *settings, **others):
+        writer = real(place, *settings, **others)
+        yield next(writer)
+        try:
+            while True:
+                writer.send((yield))
+        finally:
+            writer.close()
+            os.truncate(place, os.path.getsize(place) // 2)
+
+    monkeypatch.setattr(ffmpeg, "write_frames", cut)
+    with pytest.raises(
+        OSError, match="ffmpeg could not write the film, .* room on the disk: it has 0 of 10 pictures"
+    ):
+        softmpm.to_video(states, path, model=model)
+    assert path.read_bytes() == b"an older film" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_any_name_is_a_file(model, states, tmp_path, monkeypatch, suffix):
+    """Names with a colon or a dash, which ffmpeg would read otherwise; a draft takes no file of the user's."""
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.chdir(tmp_path)
+    own = [f"-a.new{suffix}", f"-a{suffix}.new"]
+    for name in own:
+        (tmp_path / name).write_bytes(b"precious")
+    for name in (f"2026-01-01T10:30:00{suffix}", f"-a{suffix}"):
+        assert softmpm.to_video(states[:2], name, model=model, period=0.1).is_file()
+    assert all((tmp_path / name).read_bytes() == b"precious" for name in own)
+    with pytest.raises(FileNotFoundError, match="there is no such folder: 'nowhere'"):
+        softmpm.to_video(states, f"nowhere/film{suffix}", model=model)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [dict(world=1), dict(period=0.1), dict(activation=torch.zeros(10, 1, 1))],
+    ids=lambda one: next(iter(one)),
+)
+def test_a_recording_has_its_own(recording, tmp_path, changes):
+    """What belongs to states would be ignored."""
+    with pytest.raises(
+        ValueError, match=f"{next(iter(changes))} belongs to a film of states; a recording has its own"
+    ):
+        softmpm.to_video(recording, tmp_path / "film.gif", **changes)
+
+
+def test_frames_whose_times_fall_are_refused(model, states, tmp_path):
+    """They have no order to be shown in."""
+    with softmpm.Recorder(tmp_path / "run.h5", model) as recorder, recorder.episode(0) as episode:
+        for k in (1, 0):
+            episode.frame(0.1 * k, states[k])
+    with pytest.raises(ValueError, match=r"times of the frames must not fall, got 0.1 s first and 0 s last"):
+        softmpm.to_video(tmp_path / "run.h5", tmp_path / "film.gif")

@@ -1,5 +1,6 @@
 """A Rerun file shows what the recording holds, when it happened, the right way up."""
 
+import os
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ from surface_scenes import block, forces_of, made, record_forces
 import softmpm
 from softmpm.__main__ import main
 from softmpm.recording import rerun_blueprint, style
+from softmpm.recording.selection import ALONE, plan
 
 chunk = pytest.importorskip("rerun.chunk")
 
@@ -270,3 +272,33 @@ def test_a_recording_is_not_replaced(tmp_path, name):
         with pytest.raises(ValueError, match="would replace the recording"):
             softmpm.to_rerun(path, rrd)
     assert path.read_bytes() == before
+
+
+def test_an_unfinished_file_is_an_error(tmp_path, monkeypatch):
+    """As of a full disk, which Rerun only logs: the older file is as it was. So is a folder that is not there."""
+    import rerun as rr
+
+    path = make(tmp_path / "run.h5")
+    rrd = softmpm.to_rerun(path)
+    whole, real = rrd.read_bytes(), rr.RecordingStream.disconnect
+
+    def cut(stream):
+        real(stream)
+        for draft in tmp_path.glob("*.unfinished-*"):
+            os.truncate(draft, draft.stat().st_size - 5)
+
+    monkeypatch.setattr(rr.RecordingStream, "disconnect", cut)
+    with pytest.raises(
+        OSError, match=r"cannot be written: Rerun left an unfinished file of .* room on the disk"
+    ):
+        softmpm.to_rerun(path)
+    assert rrd.read_bytes() == whole and not list(tmp_path.glob("*unfinished*"))
+    with pytest.raises(FileNotFoundError, match="there is no such folder"):
+        softmpm.to_rerun(path, tmp_path / "nowhere" / "run.rrd")
+
+
+def test_simulations_of_one_frame_follow_each_other(tmp_path):
+    """Such as the last posture of each iteration: each is on display for a while."""
+    with softmpm.Recording(make(tmp_path / "run.h5", frames=1)) as source:
+        times = [one.time.item() for one in plan(source, 1, None).simulations]
+    assert times == pytest.approx([0.0, ALONE])

@@ -24,6 +24,7 @@ from helpers import busy_scene
 
 import softmpm
 from softmpm.recording import file as recording_file
+from softmpm.recording import reader
 from softmpm.recording.superblock import readable
 from softmpm.recording.writer import strain
 
@@ -650,3 +651,80 @@ def test_the_name_of_a_contact_fits(monkeypatch):
     layout = importlib.util.module_from_spec(found)
     found.loader.exec_module(layout)
     assert layout.STATIC["wall_contact"][0].itemsize == len("separate_slowly")
+
+
+def test_frames_may_follow_while_a_recording_is_opened(tmp_path, monkeypatch):
+    """Rows that came after the reader had looked at the file's size lie beyond that."""
+    model, path = small_model(), tmp_path / "run.h5"
+    real, frames = reader.readable, []
+    with softmpm.Recorder(path, model) as recorder, recorder.episode(0) as episode:
+
+        def one_more(path: Path):
+            found = real(path)
+            episode.frame(0.1 * len(frames), moved(model, len(frames)), field=torch.full((*NODES, 2), 1.0))
+            frames.append(path)
+            return found
+
+        episode.frame(0.0, moved(model, -1.0))
+        monkeypatch.setattr(reader, "readable", one_more)
+        for _ in range(40):
+            with softmpm.Recording(path) as recording:
+                assert len(recording.frames(0)["x"]) == len(frames) + 1
+
+
+@pytest.mark.parametrize("part", [True, False])
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_recorder_goes_on_after_an_interrupt(tmp_path, monkeypatch, part, when):
+    """Within a frame, as in a notebook: the frames before and after it are those that were given."""
+    model, path = small_model(), tmp_path / "run.h5"
+    field = torch.full((*NODES, 2), 1.0) if part else None
+    with softmpm.Recorder(path, model) as recorder, recorder.episode(0) as episode:
+        for k in range(3):
+            episode.frame(0.1 * k, moved(model, k), field=field)
+        real = recorder._write
+
+        def interrupted(name: str, rows: np.ndarray) -> None:
+            if when == "after":
+                real(name, rows)
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(recorder, "_write", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                episode.frame(0.3, moved(model, 3), field=field)
+        for k in (4, 5):
+            episode.frame(0.1 * k, moved(model, k), field=field)
+    with softmpm.Recording(path) as recording:
+        found = recording.frames(0)
+    given = [0, 1, 2, *([3] if when == "after" else []), 4, 5]
+    np.testing.assert_allclose(found["time"], 0.1 * np.array(given))
+    np.testing.assert_allclose(found["x"][:, 0, 0] - found["x"][0, 0, 0], given, atol=1e-5)
+    assert not part or len(found["field"]) == len(given)
+
+
+@pytest.mark.parametrize("before", [-1, 1.5, "3"])
+def test_what_is_no_iteration_to_resume_before_is_refused(tmp_path, before):
+    """It would drop the whole recording."""
+    model, path = small_model(), tmp_path / "run.h5"
+    with softmpm.Recorder(path, model) as recorder:
+        record(recorder, model, 0)
+    with pytest.raises((ValueError, TypeError), match="resume_before"):
+        softmpm.Recorder(path, model, resume_before=before)
+    with softmpm.Recording(path) as recording:
+        assert recording.episodes == (0,)
+
+
+def test_a_recording_is_open_where_it_was_opened(tmp_path, monkeypatch):
+    """Also after a change of the folder, and of its name; a closed one says so."""
+    model = small_model()
+    monkeypatch.chdir(tmp_path)
+    with softmpm.Recorder("run.h5", model) as recorder:
+        record(recorder, model, 0)
+    with softmpm.Recording("run.h5") as recording:
+        (tmp_path / "sub").mkdir()
+        monkeypatch.chdir(tmp_path / "sub")
+        assert len(recording.frames(0)["x"]) == 4
+        (tmp_path / "run.h5").rename(tmp_path / "other.h5")
+        assert len(recording.frames(0)["x"]) == 4
+    with pytest.raises(ValueError, match="run.h5: this recording is closed"):
+        recording.frames(0)

@@ -99,10 +99,13 @@ def test_columns_of_a_run_are_distinct(name, settings, tmp_path):
     assert len(set(columns)) == len(columns) and set(task.objective.names) < set(columns)
 
 
-@pytest.mark.parametrize("name", ["Loss", "Later", "Iteration"])
+@pytest.mark.parametrize("name", ["Loss", "Later", "Iteration", "Run", "Error"])
 def test_a_term_with_the_name_of_another_column_is_refused(name, task, model, settings, tmp_path):
     """It would take the place of the other one for whoever reads the file."""
     kind = dataclasses.make_dataclass(name, [], bases=(Effort,), frozen=True, kw_only=True)
     task = dataclasses.replace(task, objective=Objective(kind(), Effort()))
-    with pytest.raises(ValueError, match=f"has a term '{name.lower()}', but metrics.csv has another column"):
+    with pytest.raises(
+        ValueError,
+        match=f"has a term '{name.lower()}', but metrics.csv or a table of sweeps has another column",
+    ):
         metrics(Run(task, model, settings, tmp_path))

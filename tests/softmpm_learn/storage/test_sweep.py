@@ -4,6 +4,7 @@ import contextlib
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -218,15 +219,17 @@ def test_a_spoilt_outcome_is_named(run, capsys):
 
 def test_the_last_seed_that_failed_finishes_its_job(tmp_path):
     """Resumed alone, it leaves a table with a row for each seed in the folder of the job and of the sweep, and a job that finished."""
-    job, about = tmp_path / "0", dict(job=0, settings="", folder="0")
+    job, about = tmp_path / "0", dict(job=0, settings="")
     ends = [("finished", 0.1), ("finished", 0.3), ("failed", math.inf)]
     for seed, (status, loss) in enumerate(ends):
         (job / f"seed_{seed}").mkdir(parents=True)
-        sweep.record(job / f"seed_{seed}", sweep.Outcome(seed=seed, status=status, loss=loss, **about))
-    sweep.record(job, sweep.Outcome(status="failed", error="seed 2 failed", **about))
+        own = about | dict(seed=seed, folder=str(job / f"seed_{seed}"))
+        sweep.record(job / f"seed_{seed}", sweep.Outcome(status=status, loss=loss, **own))
+    sweep.record(job, sweep.Outcome(status="failed", error="seed 2 failed", folder=str(job), **about))
     for folder in (job, tmp_path):
         sweep.tabulate(folder)
-    sweep.update(job / "seed_2", sweep.Outcome(seed=2, status="finished", loss=0.2, **about))
+    own = about | dict(seed=2, folder=str(job / "seed_2"))
+    sweep.update(job / "seed_2", sweep.Outcome(status="finished", loss=0.2, **own))
     for folder in (job, tmp_path):
         with open(folder / sweep.TABLE, newline="") as file:
             rows = list(csv.DictReader(file))
@@ -235,6 +238,20 @@ def test_the_last_seed_that_failed_finishes_its_job(tmp_path):
         ]
     whole = sweep.outcome(job)
     assert whole is not None and (whole.status, whole.loss, whole.error) == ("finished", 0.2, "")
+
+
+def test_a_copy_of_a_job_is_no_job(tmp_path):
+    """Such as a backup beside it; a copy of the whole sweep is one."""
+    for name in ("0", "1"):
+        (tmp_path / "sweep" / name).mkdir(parents=True)
+        about = dict(job=int(name), settings="", folder=f"sweep/{name}")
+        sweep.record(tmp_path / "sweep" / name, sweep.Outcome(status="finished", loss=0.1, **about))
+    shutil.copytree(tmp_path / "sweep" / "0", tmp_path / "sweep" / "0_backup")
+    shutil.copytree(tmp_path / "sweep", tmp_path / "copy")
+    for folder in (tmp_path / "sweep", tmp_path / "copy"):
+        sweep.tabulate(folder)
+        with open(folder / sweep.TABLE, newline="") as file:
+            assert [row["job"] for row in csv.DictReader(file)] == ["0", "1"]
 
 
 def test_folders_are_named_by_the_command():
