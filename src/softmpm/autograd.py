@@ -169,7 +169,12 @@ def cast(model: Model, value: Any) -> Any:
         return value.to(model.dtype) if value.is_floating_point() else value
     if isinstance(value, (Nodal, SurfaceState)):
         return value.to(model.dtype)
+    if not isinstance(value, (State, Low, Params)):
+        return value  # of a wrong type, which is refused by name
     return type(value)(*(cast(model, part) for part in value))
+
+
+_autograd: Any = torch._C._autograd  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @dataclass(eq=False)
@@ -266,6 +271,8 @@ class _SimulateBackward(FirstOrderAdjoint):
         adj_end = kind.of([torch.zeros_like(like) if adj is None else adj for adj, like in pairs])
         with explain_out_of_memory(call.model, call.horizon, gradient=True), at(call.place):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
+        if not _autograd._get_current_graph_task_keep_graph():
+            call.trail = None  # PyTorch frees only what is saved with it, and refuses a second backward pass
         found = (adj_inputs.tensors.get(name) for name in call.names)
         exact = (
             adj if adj is None else adj.to(value.dtype)

@@ -90,6 +90,8 @@ def check_inputs_bounds(model: ModelLike, given: dict[str, Tensor]) -> None:
     if not given:
         return
     given = {name: value.detach() for name, value in given.items()}
+    for name, value in given.items():
+        need(value.numel() > 0, f"inputs.{name} is empty, got shape {tuple(value.shape)}; leave it out.")
     ends = [end.double() for value in given.values() for end in torch.aminmax(value)]
     ends = torch.stack(ends).tolist()
     for (name, value), low, high in zip(given.items(), ends[::2], ends[1::2], strict=True):

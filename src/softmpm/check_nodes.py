@@ -27,14 +27,16 @@ def check_shown(apart: Tensor) -> None:
 
 
 def check_gradients_of_nodes(state: State) -> None:
-    """Raise ValueError if a gradient with respect to the particles of a state would be lost, since a call starts from its nodes."""
+    """Raise ValueError if a gradient with respect to the particles of a state would be lost, since a call starts from its nodes: they
+    have no history, or a particle's tensor is a leaf, which only a user makes one."""
     nodes = state.nodes
-    if nodes is None or not torch.is_grad_enabled() or nodes.u.requires_grad or nodes.v.requires_grad:
+    if nodes is None or not torch.is_grad_enabled():
         return
+    shown = nodes.u.requires_grad or nodes.v.requires_grad
     for name, tensor in zip("xvCF", state[:4], strict=True):
         need(
-            not tensor.requires_grad,
-            f"state.{name} requires a gradient, but state.nodes, from which a call continues, does not; take "
+            not tensor.requires_grad or (shown and not tensor.is_leaf),
+            f"state.{name} requires a gradient, but a call continues from state.nodes, whose gradient does not reach it; take "
             "state._replace(nodes=None), whose nodes are computed from x, v, C and F.",
         )
 

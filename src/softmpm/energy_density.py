@@ -16,6 +16,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from softmpm.batches import FirstOrderAdjoint
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
 
 _SQUARINGS = 20
@@ -70,13 +71,38 @@ def _square(H: Tensor) -> Tensor:
 
 
 def _distance(H: Tensor) -> Tensor:
-    """|F − R|². R is the nearest rotation, so its derivative does not contribute."""
-    return ((H - rotation_change(H)) ** 2).sum((-2, -1))
+    """|F − R|²."""
+    return _Distance.apply(H)
 
 
-@torch.no_grad()
+class _Distance(torch.autograd.Function):
+    """|F − R|². R is the nearest rotation, so that its derivative does not contribute to the first derivative, and only to that."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(H: Tensor) -> Tensor:
+        return ((H - rotation_change(H)) ** 2).sum((-2, -1))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx, adj):
+        return _DistanceAdj.apply(*ctx.saved_tensors, adj)
+
+
+class _DistanceAdj(FirstOrderAdjoint):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(H: Tensor, adj: Tensor) -> Tensor:
+        return 2 * adj[..., None, None] * (H - rotation_change(H))
+
+
 def rotation_change(H: Tensor) -> Tensor:
-    """Q = R − I of the proper rotation R nearest to F, also for det F < 0, shape (..., dim, dim). A constant of the gradient.
+    """Q = R − I of the proper rotation R nearest to F, also for det F < 0, shape (..., dim, dim).
 
     In three dimensions the unit quaternion of R is the eigenvector of the largest eigenvalue of Davenport's matrix K(F). Squaring
     K + c I time and again finds it without a factorisation, which a CUDA graph could not capture.

@@ -1,6 +1,5 @@
 """Forces of the walls as functions of a state. Derivation: (K7) of docs/math/contact.md and (B3) of docs/math/mirror.md."""
 
-import torch
 from torch import Tensor
 
 from softmpm.check_state import check_state
@@ -84,6 +83,7 @@ def _clamp_forces(model: Model, state: State) -> Tensor:
         raise ValueError(
             "clamp_forces needs a state that simulate returned, got one without nodes or their reaction; simulate from it first."
         )
-    return torch.einsum(
-        "kgd,wgd->wkd", model.mirror.shares.to(state.nodes.reaction.dtype), state.nodes.reaction
-    )
+    reaction = (
+        state.nodes.reaction.double()
+    )  # a product of matrices would be in half precision under autocast
+    return (model.mirror.shares.double()[None] * reaction[:, None]).sum(dim=2).to(model.dtype)

@@ -10,6 +10,7 @@ from torch import Tensor
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
 from softmpm.check_state import check_finite, check_state
 from softmpm.checks import check_params, check_row
+from softmpm.compiling import opaque
 from softmpm.inputs import INPUTS, Input, Inputs, differentiable, stored
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import element_type
@@ -173,6 +174,13 @@ def warp_state(
         TypeError, ValueError: As :func:`softmpm.simulate`, for the model and the state.
         UnstableError: A particle is off the grid.
     """
+    return _warp_state(model, state, solid, requires_grad)
+
+
+@opaque
+def _warp_state(
+    model: Model, state: State | None, solid: WarpSolid | None, requires_grad: bool
+) -> WarpState | WarpNodal:
     check_model(model, "warp_state")
     if state is not None:
         check_state(model, state)
@@ -199,6 +207,11 @@ def _warp_nodal(model: Model, state: State, solid: WarpSolid | None, requires_gr
 
 def torch_state(model: Model, state: WarpState | WarpNodal) -> State:
     """The :class:`softmpm.State` that a state of this model in Warp arrays holds, in new tensors."""
+    return _torch_state(model, state)
+
+
+@opaque
+def _torch_state(model: Model, state: WarpState | WarpNodal) -> State:
     check_own(model, "torch_state", state=state)
     if isinstance(state, WarpNodal):
         return particles_of(model, state.nodal().clone())

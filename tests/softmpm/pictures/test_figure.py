@@ -438,14 +438,13 @@ def test_any_style_leaves_letters_dark(model):
     """On white panels; axes of the user's own have the colours of their figure."""
     from matplotlib import rc_context
     from matplotlib.colors import same_color
+    from matplotlib.text import Text
 
     look = {"text.color": "white", "axes.labelcolor": "white", "xtick.color": "white", "ytick.color": "white"}
     state = model.rest()
     with rc_context(look):
         for figure in (softmpm.show(model, state), softmpm.show(model)):
-            letters = [
-                text for text in figure.findobj(lambda one: hasattr(one, "get_text")) if text.get_text()
-            ]
+            letters = [text for text in figure.findobj(Text) if text.get_text()]
             assert letters and all(same_color(text.get_color(), "black") for text in letters)
         own = Figure().subplots()
         softmpm.show(model, state, axes=own)

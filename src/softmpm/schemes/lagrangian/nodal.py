@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from softmpm.check_nodes import check_gradients_of_nodes, check_projected, check_reflected, check_shown
+from softmpm.compiling import opaque
 from softmpm.model import Model
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.inputs import of_surface_walls
@@ -71,6 +72,7 @@ def start_of(model: Model, state: State, mass: Tensor, normals: Tensor | None = 
     return with_reaction(model, nodes, nodes.reaction)
 
 
+@opaque
 def check_their_nodes(model: Model, state: State) -> None:
     """The particles of a state show its nodes; values are not checked during a capture.
 

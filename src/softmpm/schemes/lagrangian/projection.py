@@ -98,11 +98,27 @@ class _ShowAdj(FirstOrderAdjoint):
         return tuple(_show_adj(model, C, F, *(cleared(like) if one is None else one for one, like in pairs)))
 
 
-@on_its_gpu
 def apart(model: Model, ours: State, theirs: State) -> Tensor:
-    """Largest differences of x, v, C and F between two states, shape (4,)."""
+    """Largest differences of x, v, C and F between two states, shape (4,), without a gradient."""
+    return _Apart.apply(model, *ours.detach()[:4], *theirs.detach()[:4])
+
+
+class _Apart(FirstOrder):
+    """A function for the transforms of ``torch.func``, whose wrappers have no memory that a kernel could read."""
+
+    @staticmethod
+    def forward(model, *fields):
+        return _apart(model, *fields)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.mark_non_differentiable(output)
+
+
+@on_its_gpu
+def _apart(model: Model, *given: Tensor) -> Tensor:
     one, found = _Arrays(model), torch.zeros(4, dtype=model.dtype, device=model.device)
-    lead, fields = (model.worlds, model.particle_count), one.views(*ours.detach()[:4], *theirs.detach()[:4])
+    lead, fields = (model.worlds, model.particle_count), one.views(*given)
     kernel = shown_by(model.spec.dim, model.spec.dtype).apart
     # Not in parts, whose threads would share the result:
     one.launch(kernel, lead, *fields, passing(found, one.types.real))
