@@ -234,7 +234,9 @@ def test_a_gradient_that_nodes_would_lose_is_refused():
     warm = softmpm.simulate(model, model.rest(), None, params, substeps=3).detach()
     kick = torch.zeros(2, dtype=torch.float64, requires_grad=True)
     kicked = warm._replace(v=warm.v + kick)
-    with pytest.raises(ValueError, match=r"state.v requires a gradient, but a call continues from state.nodes, .*nodes=None"):
+    with pytest.raises(
+        ValueError, match=r"state.v requires a gradient, but a call continues from state.nodes, .*nodes=None"
+    ):
         softmpm.simulate(model, kicked, None, params, substeps=3)
     with torch.no_grad():
         softmpm.simulate(model, kicked, None, params, substeps=3)

@@ -34,6 +34,21 @@ TINY = [
     "train.pictures=false",
 ]
 
+OWN = """import torch
+from softmpm_learn import register
+
+class Own(torch.nn.Linear):
+    def forward(self, z, time, goal=None):
+        return self.mixed(torch.tanh(super().forward(z)))
+
+    def mixed(self, a):
+        return a @ torch.ones(3, 4)
+
+@register.policy("own")
+def own(conf, space):
+    return Own(space.features, space.muscles)
+"""
+
 
 @pytest.fixture(autouse=True)
 def fresh_tables(monkeypatch):
@@ -307,3 +322,12 @@ def test_a_builder_that_returns_something_else_is_refused():
     register.policy("nothing")(lambda conf, space: None)
     with pytest.raises(ValueError, match="policy nothing must be a torch.nn.Module, got NoneType"):
         make_policy(PolicyConf(name="nothing"), 3, 2, 1.0, seed=0)
+
+
+def test_an_error_in_a_file_of_one_s_own_has_its_line(folder):
+    """Any error of PyTorch looks alike; the traceback is named too."""
+    (folder / "own.py").write_text(OWN)
+    done = run(folder, "own.py", "task=arm", "policy=own", *TINY, "hydra.run.dir=run")
+    assert done.returncode == 1 and "cannot be multiplied" in done.stderr
+    assert "(RuntimeError in own.py, line 9)" in done.stderr and "The traceback is in" in done.stderr
+    assert "in mixed" in (folder / "run" / "error.txt").read_text()

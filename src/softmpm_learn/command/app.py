@@ -142,6 +142,7 @@ def _swept(
     mine = Job(number=number, settings=" ".join(hydra_config.overrides.task), out=out, table=table)
     try:
         mine.conf = _configured(config, out, group)
+        mine.seed = mine.conf.train.seed if mine.conf.train.seeds == 1 else None
         before = group.broadcast(group.once(sweep.outcome, out))
         if before and before.status == "finished" and before.iterations >= mine.conf.train.iterations:
             group.once(sweep.tabulate, table.parent)  # a kill may have come between outcome and table

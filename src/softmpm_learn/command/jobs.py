@@ -7,12 +7,14 @@ import dataclasses
 import gc
 import logging
 import math
+import os
 import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from softmpm_learn import plugins
 from softmpm_learn.command import seeds
 from softmpm_learn.command.experiment import run_experiment, run_side_by_side
 from softmpm_learn.command.sentences import EXPECTED, end, give_up, sentence
@@ -56,11 +58,13 @@ class Job:
     table: Path
     """Table of the sweep."""
     conf: RunConf = dataclasses.field(default_factory=RunConf)
+    seed: int | None = None
+    """Its seed, if it has one and could be configured."""
 
     @property
     def about(self) -> dict:
         """Its outcome besides the result."""
-        return {"job": self.number, "settings": self.settings, "folder": str(self.out)}
+        return {"job": self.number, "seed": self.seed, "settings": self.settings, "folder": str(self.out)}
 
 
 def side_by_side(jobs: Sequence[Job]) -> list[list[Job]]:
@@ -172,12 +176,26 @@ def experiments(jobs: Sequence[tuple[RunConf, Path]], group: Group, signals: Sig
 
 
 def _left(error: Exception, out: Path, group: Group) -> str:
-    """Leave the traceback in the folder of the run, unless that or the error is another's; gives a note on its place for people."""
+    """Leave the traceback in the folder of the run, unless that or the error is another's; gives a note on its place for people, and on
+    the line of theirs that it came from."""
+    line = _own_line(error)
+    known = isinstance(error, EXPECTED) and not line
     place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
     if isinstance(error, LockedError) or is_lost(error):
         return ""
     try:
         files.replace(place, "".join(traceback.format_exception(error)).encode())
     except OSError as other:
-        return "" if isinstance(error, EXPECTED) else f" The traceback could not be saved: {other}"
-    return "" if isinstance(error, EXPECTED) else f" The traceback is in {place}."
+        return line if known else f"{line} The traceback could not be saved: {other}"
+    return "" if known else f"{line} The traceback is in {place}."
+
+
+def _own_line(error: BaseException | None) -> str:
+    """The last line of a user's file that an error came through, in words; empty if there is none."""
+    own, found = set(plugins.files()), ""
+    while error is not None:
+        for frame in traceback.extract_tb(error.__traceback__):
+            if str(Path(frame.filename).resolve()) in own:
+                found = f" ({type(error).__name__} in {os.path.relpath(frame.filename)}, line {frame.lineno})"
+        error = None if found else error.__cause__ or error.__context__
+    return found

@@ -9,6 +9,9 @@ import numpy as np
 
 RESAMPLES = 10_000
 LEVEL = 0.95
+FEWEST = 5
+"""Pairs below which no difference is marked as one: between equal settings an interval leaves zero out in 53 % of cases with two pairs,
+24 % with three, 14 % with five, 10 % with ten."""
 SEED = 0
 """Of the resampling, so that a table is the same each time."""
 
@@ -61,3 +64,8 @@ def pairs(
             }
         )
     return rows
+
+
+def stands_out(row: Mapping[str, Any]) -> bool:
+    """True for a difference whose interval leaves zero out, of at least :data:`FEWEST` pairs."""
+    return row["pairs"] >= FEWEST and (row["low"] > 0 or row["high"] < 0)

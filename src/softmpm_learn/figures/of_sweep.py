@@ -10,7 +10,7 @@ import numpy as np
 
 from softmpm_learn.figures import canvas
 from softmpm_learn.figures.canvas import COLOURS
-from softmpm_learn.figures.intervals import interval
+from softmpm_learn.figures.intervals import FEWEST, interval, stands_out
 from softmpm_learn.figures.tables import Row, compared
 
 LINES = "-", "--", ":"
@@ -237,7 +237,7 @@ def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[
         axes.axvline(0.0, color="0.6", linewidth=0.8)
         drawn = [row for row in pairs if row["quantity"] == name]
         for place, row in enumerate(drawn):
-            colour = COLOURS[0] if row["low"] > 0 or row["high"] < 0 else "0.45"
+            colour = COLOURS[0] if stands_out(row) else "0.45"
             axes.plot([row["low"], row["high"]], [place] * 2, color=colour, linewidth=2)
             axes.plot(row["difference"], place, "o", color=colour, markersize=5)
         return [row["difference"] for row in drawn]
@@ -247,7 +247,8 @@ def pairs_figure(path: Path, pairs: Sequence[Mapping[str, Any]], jobs: Sequence[
         names,
         panels,
         draw,
-        "mean over pairs of seeds, of the examination the median; bootstrap interval of 95 %; blue: without zero",
+        "mean over pairs of seeds, of the examination the median; bootstrap interval of 95 %; blue: without zero, of "
+        f"{FEWEST} pairs or more",
     )
     return True
 

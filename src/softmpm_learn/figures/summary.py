@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from softmpm_learn.figures.intervals import interval
+from softmpm_learn.figures.intervals import FEWEST, interval, stands_out
 from softmpm_learn.figures.of_sweep import values
 from softmpm_learn.figures.tables import Row, compared, iteration_of
 from softmpm_learn.lasting import LEVEL, SHARE
@@ -26,7 +26,8 @@ NOTE = (
 )
 DIFFERENCES = (
     "The first setting minus this one, paired by seed: the mean, of the examination the median, with its bootstrap interval of 95 %; "
-    "bold where that does not contain zero. In parentheses the number of pairs, where it is not that of all seeds."
+    f"bold where that does not contain zero, of {FEWEST} pairs or more. In parentheses the number of pairs, where it is not that of "
+    "all seeds."
 )
 
 
@@ -110,7 +111,7 @@ def _difference(row: Mapping[str, Any], members: Sequence[Row]) -> str:
     if not row["pairs"]:
         return "none"
     text = f"{row['difference']:.3g} [{row['low']:.3g}, {row['high']:.3g}]"
-    if row["low"] > 0 or row["high"] < 0:
+    if stands_out(row):
         text = f"**{text}**"
     return text if row["pairs"] == len(members) else f"{text} ({row['pairs']})"
 

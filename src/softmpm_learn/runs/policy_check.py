@@ -18,32 +18,55 @@ STEPS = 8
 
 
 def check_policy(
-    name: str, policy: nn.Module, size: int, times: Tensor, worlds: int, goal: Tensor | None = None
+    name: str,
+    policy: nn.Module,
+    size: int,
+    muscles: int,
+    times: Tensor,
+    worlds: int,
+    goal: Tensor | None = None,
 ) -> None:
     """Ask a policy about each control step alone, twice, and about all of them at once. Random numbers that it draws are not those
     of a run.
 
     Args:
-        size: Number of features.
+        size, muscles: Number of features and of activations.
         times: Times at which control steps begin [s], shape (step,).
         goal: A goal of each world [m], shape (world, dim).
 
     Raises:
-        ValueError: The activations or their gradients differ.
+        ValueError: The activations have another shape than (world, muscle), or they or their gradients differ.
     """
     times = times[:: math.ceil(len(times) / STEPS)]
     z = torch.linspace(-1.0, 1.0, len(times) * worlds * size).to(times).view(-1, worlds, size)
+
+    def at_once() -> Tensor:
+        try:
+            return policy(z, times[:, None], goal)
+        except Exception as error:
+            error.add_note(
+                f"policy {name} was asked for {len(times)} control steps at once, with features of shape {tuple(z.shape)} and times of "
+                f"shape ({len(times)}, 1)."
+            )
+            raise
 
     def in_turn() -> Tensor:
         return torch.stack([policy(features, time, goal) for features, time in zip(z, times, strict=True)])
 
     with seeded(0, z.device):
-        answers = in_turn(), in_turn(), policy(z, times[:, None], goal)
-    first, at_once = answers[0], answers[2]
-    if at_once.shape != first.shape:
+        one, wanted = policy(z[0], times[0], goal), (worlds, muscles)
+        if one.shape != wanted:
+            raise ValueError(
+                f"policy {name} must give activations of shape (world, muscle) = {wanted} for one control step, got "
+                f"{tuple(one.shape)}; an open loop, which sees a time of shape () or, of many control steps, (step, 1), ends with "
+                ".expand(*z.shape[:-1], -1)."
+            )
+        answers = in_turn(), in_turn(), at_once()
+    first, whole = answers[0], answers[2]
+    if whole.shape != first.shape:
         raise ValueError(
             f"policy {name} must give activations of shape (step, world, muscle) = {tuple(first.shape)} for {len(times)} control steps "
-            f"at once, got {tuple(at_once.shape)}: write forward for any number of leading axes."
+            f"at once, got {tuple(whole.shape)}: write forward for any number of leading axes."
         )
     _need_equal(name, "activations", *([answer] for answer in answers))
     weights = [p for p in policy.parameters() if p.requires_grad]

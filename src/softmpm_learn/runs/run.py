@@ -107,7 +107,9 @@ class Run:
         )
         policy = policy.to(self.model.device, self.model.dtype)
         times, worlds = times_of(self.task, self.model), len(self.worlds)
-        check_policy(conf.name, policy, self.observer.size, times, worlds, self.goals.middle())
+        check_policy(
+            conf.name, policy, self.observer.size, self.model.muscle_count, times, worlds, self.goals.middle()
+        )
         return policy
 
     def _make_design(self) -> Design:

@@ -29,7 +29,7 @@ class Outcome:
     job: int
     """Number in the sweep."""
     seed: int | None = None
-    """Seed, where a job has several side by side."""
+    """Seed; None of a job with several side by side before any of them began, or with settings that could not be read."""
     status: str
     """finished or failed."""
     loss: float = math.inf
@@ -123,9 +123,9 @@ def tabulate(sweep: Path) -> None:
     for path in sweep.rglob(OUTCOME):
         at, found = path.parent, outcome(path.parent)
         inside = at.relative_to(sweep).parts
-        if (
-            found and Path(found.folder).parts[-len(inside) :] == inside
-        ):  # else a copy of another job's folder
+        if found and (
+            not inside or Path(found.folder).parts[-len(inside) :] == inside
+        ):  # else a copy of a job's folder
             known[at] = found
     seeds: dict[Path, list[Path]] = {}
     for folder in known:

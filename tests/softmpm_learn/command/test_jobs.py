@@ -90,6 +90,7 @@ def test_a_job_that_cannot_begin_leaves_the_others(run, begun, capsys):
     code, (failed, finished) = run("sweep", *choices)
     assert code == 1 and begun == [2, 1, 1]
     assert (failed["status"], finished["status"]) == ("failed", "finished")
+    assert failed["seed"] == finished["seed"] == "0"
     assert "observer.clusters must not be above" in failed["error"] and math.isfinite(float(finished["loss"]))
     assert "softmpm_learn: job 0: observer.clusters" in capsys.readouterr().err
 

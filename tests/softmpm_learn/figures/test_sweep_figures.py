@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from softmpm_learn.figures import __main__ as program
 from softmpm_learn.figures.canvas import COLOURS
-from softmpm_learn.figures.intervals import interval, pairs
+from softmpm_learn.figures.intervals import interval, pairs, stands_out
 from softmpm_learn.figures.summary import passes
 from softmpm_learn.figures.sweeps import EXAMINED, parse
 
@@ -307,7 +307,7 @@ def test_the_summary_has_a_row_for_each_setting(tmp_path):
         ["kmeans", "-0.75 [-1, -0.5]", "-0.2", "0.9 (1)", "5", "1 of 3", "1 of 3"],
     ]
     (row,) = differences[1:]
-    assert differences[0] == medians[0][:-2] and row[:2] == ["kmeans", "**-1.75 [-3, -0.5]** (2)"]
+    assert differences[0] == medians[0][:-2] and row[:2] == ["kmeans", "-1.75 [-3, -0.5] (2)"]
 
 
 def test_without_an_examination_there_is_no_verdict(tmp_path):
@@ -501,3 +501,11 @@ def test_escaped_characters_are_read_as_hydra_reads_them():
         assert parse(f"task.file={value} train.seed=1") == {"task.file": value, "train.seed": "1"}
         assert OverridesParser.create().parse_override(f"task.file={value}").get_value_string() == value
     assert parse("train.seed=1 task.file=C:\\robots\\") == {"train.seed": "1", "task.file": "C:\\robots\\"}
+
+
+@pytest.mark.parametrize("count, marked", [(4, False), (5, True)])
+def test_few_pairs_mark_no_difference(count, marked):
+    """The interval of two equal differences has no width at all."""
+    groups = {"a": dict.fromkeys(range(count), 1.0), "b": dict.fromkeys(range(count), 2.0)}
+    (row,) = pairs(groups, "loss")
+    assert row["high"] < 0 and stands_out(row) is marked

@@ -88,7 +88,7 @@ FINE = {
 
 
 def ask(policy: nn.Module, device="cpu", dtype=torch.float64) -> None:
-    check_policy("odd", policy.to(device, dtype), 3, TIMES.to(device, dtype), 2)
+    check_policy("odd", policy.to(device, dtype), 3, 2, TIMES.to(device, dtype), 2)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -130,6 +130,26 @@ def test_activations_of_another_shape_are_refused():
         ask(Odd(lambda u, time: u[-1] if u.dim() == 3 else u))
 
 
+def test_an_open_loop_without_worlds_is_refused():
+    """It forgets the axis; the sentence has the remedy, which is one."""
+    wave = lambda time: torch.sin(time[..., None] * torch.tensor([1.0, 2.0]).double())  # noqa: E731
+    with pytest.raises(
+        ValueError, match=r"of shape \(world, muscle\) = \(2, 2\) for one control step, got \(2,\); .*expand"
+    ):
+        ask(Odd(lambda u, time: wave(time)))
+    ask(Odd(lambda u, time: wave(time).expand(*u.shape[:-1], -1)))
+
+
+def test_what_was_asked_is_said():
+    """Where a policy fails on many control steps at once."""
+    with pytest.raises(RuntimeError) as error:
+        ask(Odd(lambda u, time: u + time * torch.ones(2).double()))
+    assert (
+        "asked for 7 control steps at once, with features of shape (7, 2, 3) and times of shape (7, 1)"
+        in error.value.__notes__[0]
+    )
+
+
 @pytest.mark.parametrize("name", [name for name, entry in register.POLICIES.items() if entry.is_own])
 @pytest.mark.parametrize("goal", [None, torch.rand(2, 2)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -139,7 +159,7 @@ def test_the_policies_of_the_package_are_not_refused(name, goal, dtype):
     for gain in (0.0, 1.0):
         conf = PolicyConf(name=name, gain=gain)
         policy = make_policy(conf, 3, 2, 2.0, seed=0, goal=None if goal is None else box).to(dtype)
-        check_policy(name, policy, 3, TIMES.to(dtype), 2, None if goal is None else goal.to(dtype))
+        check_policy(name, policy, 3, 2, TIMES.to(dtype), 2, None if goal is None else goal.to(dtype))
     assert torch.equal(torch.get_rng_state(), before)
 
 
