@@ -21,7 +21,8 @@ def check_observer(observer: Observer, model: Model) -> None:
     the same for each question, and none of a run.
 
     Raises:
-        ValueError: Its features have another shape than (world, size), differ from one time to the other, or the state does.
+        ValueError: Its features have another shape than (world, size), or differ from one time to the other; or it changes the state in
+            place.
     """
     kind, wanted = type(observer).__name__, (model.worlds, observer.size)
     moved, answers = probe(model), list[Tensor]()

@@ -53,6 +53,18 @@ class Horizon:
         """Number of substeps."""
         return self.control_steps * self.substeps
 
+    def counted(self, longest: int) -> tuple[int, list[int]]:
+        """Number of the :meth:`chunks`, and the length of each of their shapes, without building them."""
+        if self.substeps <= longest:
+            length, whole = self.substeps * (longest // self.substeps), self.total
+            times = 1
+        else:
+            length, whole = math.ceil(self.substeps / math.ceil(self.substeps / longest)), self.substeps
+            times = self.control_steps
+        full, rest = divmod(whole, length)
+        lengths = [length] * bool(full) + [rest] * bool(rest)
+        return times * (full + bool(rest)), lengths if times else []
+
     @functools.lru_cache(maxsize=256)  # noqa: B019 - caches numbers, not simulated states
     def chunks(self, longest: int) -> tuple[Chunk, ...]:
         """Chunks of at most ``longest`` substeps: several whole control steps, or equal parts of one.

@@ -151,26 +151,25 @@ def plan(horizon, sizes: Sizes, budget: int) -> Plan:
     Raises:
         ValueError: Not even one substep at a time fits.
     """
-    chunks = horizon.chunks(sizes.longest)
-    everything = horizon.total * (sizes.inside + sizes.nodes) + len(chunks) * (sizes.inside + sizes.apart)
-    everything += max(len(chunks) - 1, 0) * sizes.passed_on
-    derived = sizes.derived * sum(n for n, _ in {chunk.shape for chunk in chunks})
+    count, lengths = horizon.counted(sizes.longest)
+    everything = horizon.total * (sizes.inside + sizes.nodes) + count * (sizes.inside + sizes.apart)
+    everything += max(count - 1, 0) * sizes.passed_on
+    derived = sizes.derived * sum(lengths)
     others = sizes.calls - 1
     if sizes.calls * everything + derived + others * sizes.start <= budget or horizon.total == 0:
         return Plan(sizes.longest, 0, everything, derived)
     room = budget - others * (sizes.start - sizes.between)  # the first checkpoint is the initial state
     best, least = None, math.inf
     for longest in _lengths(horizon.substeps, sizes.longest):
-        chunks = horizon.chunks(longest)
+        count, lengths = horizon.counted(longest)
         step, once = sizes.inside + sizes.derived + sizes.nodes, sizes.inside + sizes.apart
-        inside = sum(n * step + once for n, _ in {chunk.shape for chunk in chunks})
-        stored = min(len(chunks), (room - inside - sizes.between) // (sizes.calls * sizes.between))
+        inside = sum(n * step + once for n in lengths)
+        stored = min(count, (room - inside - sizes.between) // (sizes.calls * sizes.between))
         if stored < 1:
             continue
-        runs = recomputed(len(chunks), stored)
-        length = max(chunk.length for chunk in chunks)
+        runs = recomputed(count, stored)
         # Each chunk runs forward and backward; some are recomputed in between.
-        if (cost := runs * length + (2 * len(chunks) + runs) * sizes.price) < least:
+        if (cost := runs * max(lengths) + (2 * count + runs) * sizes.price) < least:
             best, least = Plan(longest, stored, stored * sizes.between, inside + sizes.between), cost
     if best is None:
         one = 2 * sizes.inside + sizes.derived + sizes.nodes + sizes.apart

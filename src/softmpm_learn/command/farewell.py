@@ -12,6 +12,7 @@ from pathlib import Path
 import softmpm
 from softmpm_learn import plugins
 from softmpm_learn.command.pictures import last_episode
+from softmpm_learn.runs.run import Run
 from softmpm_learn.storage import sweep
 from softmpm_learn.tasks import Task
 from softmpm_learn.train import Result
@@ -26,6 +27,10 @@ def farewell(result: Result, task: Task, out: Path) -> str:
         what = "evaluation" if result.run.evaluated else "loss"
         best = result.best_iteration
         lines.append(f"Best {what} {result.best_loss:.5g}, in iteration {best}{_outcome(task, out, best)}.")
+    if _is_beginning(result.run, result.best_iteration):
+        lines.append(
+            "Only the first iteration was evaluated, so that is the robot before it learned; train.evaluate_every=1 evaluates each."
+        )
     if count := result.run.fallback.count:
         lines.append(f"It failed or fell far below its best and went back to it: {_times(count)}.")
     if count := result.run.restart.count:
@@ -42,6 +47,11 @@ def farewell(result: Result, task: Task, out: Path) -> str:
     if not result.finished:
         lines.append(f"To go on: {plugins.command()} {plugins.resume(shown)}")
     return "\n".join(lines)
+
+
+def _is_beginning(run: Run, best: int) -> bool:
+    """True if nothing but the beginning could be the best."""
+    return run.evaluated and best == 0 and 1 < run.iteration < run.settings.train.evaluate_every
 
 
 @dataclass(frozen=True)

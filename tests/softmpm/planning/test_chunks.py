@@ -16,6 +16,8 @@ def test_chunks_cover_the_call(control_steps, substeps, longest):
     chunks = horizon.chunks(longest)
     assert [s for c in chunks for s in range(c.first, c.first + c.length)] == list(range(horizon.total))
     assert max(c.length for c in chunks) <= longest
+    count, lengths = horizon.counted(longest)
+    assert count == len(chunks) and sorted(lengths) == sorted(n for n, _ in {c.shape for c in chunks})
     for chunk in chunks:
         steps = [(chunk.first + s) // substeps for s in range(chunk.length)]
         assert [chunk.rows.start + chunk.row(s) for s in range(chunk.length)] == steps

@@ -115,3 +115,11 @@ def test_sizes_of_both_schemes():
     particles = softmpm.build(busy_scene(3), device="cpu").particle_count
     assert fast.between == fast.inside + 4 * particles and fast.nodes > 0
     assert plain.nodes == 0 and fast.price == plain.price == 1
+
+
+def test_the_longest_call_is_planned_at_once():
+    """Without its chunks, of which a hundred million substeps have too many for the memory."""
+    for horizon in (Horizon(1, 10**8), Horizon(10**7, 10)):
+        before = Horizon.chunks.cache_info().currsize
+        assert plan(horizon, SIZES, 10**6).checkpoints > 0
+        assert Horizon.chunks.cache_info().currsize == before

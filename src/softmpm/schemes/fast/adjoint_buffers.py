@@ -1,5 +1,7 @@
 """Buffers of the backward pass of a chunk of the fast scheme."""
 
+import weakref
+
 import torch
 import warp as wp
 
@@ -44,7 +46,7 @@ class SharedAdjoint:
         self.adj_array = view(self.adj, t.real)
         self.node_arrays = [view(nodes, t.aligned) for nodes in self.nodes]
         self.velocity_arrays = [view(velocity, t.aligned) for velocity in self.velocity]
-        self._accumulators: dict[int, Accumulators] = {}
+        self._accumulators = weakref.WeakValueDictionary[int, Accumulators]()  # as long as a chunk has them
         self.contact = None
         if model.surface is not None:
             self.contact = SurfaceContactAdj(model, wanted, packed=True)
@@ -62,10 +64,11 @@ class SharedAdjoint:
 
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""
-        if rows not in self._accumulators:
+        found = self._accumulators.get(rows)
+        if found is None:
             nodes = self.velocity.shape[1] // self.model.worlds
-            self._accumulators[rows] = Accumulators(self.model, self.wanted, rows, nodes)
-        return self._accumulators[rows]
+            found = self._accumulators[rows] = Accumulators(self.model, self.wanted, rows, nodes)
+        return found
 
 
 class ChunkAdjoint:

@@ -1,5 +1,6 @@
 """Buffers of a chunk of the reference formulation, forward and adjoint."""
 
+import weakref
 from typing import Any
 
 import torch
@@ -175,7 +176,7 @@ class SharedAdjoint:
         self.reflected = [] if reflection is None else [reflection.vectors(), reflection.vectors()]
         self._displacements = self.u.new_empty(0)
         self.low = self.u.new_empty(0 if stores_u(self.model.spec) else self.u.shape)
-        self._accumulators: dict[int, Accumulators] = {}
+        self._accumulators = weakref.WeakValueDictionary[int, Accumulators]()  # as long as a chunk has them
 
     @property
     def state(self) -> tuple[Tensor, ...]:
@@ -191,9 +192,10 @@ class SharedAdjoint:
 
     def accumulators(self, rows: int) -> Accumulators:
         """Accumulators for chunks that touch this number of control steps, built on first use."""
-        if rows not in self._accumulators:
-            self._accumulators[rows] = Accumulators(self.model, self.wanted, rows, self.held)
-        return self._accumulators[rows]
+        found = self._accumulators.get(rows)
+        if found is None:
+            found = self._accumulators[rows] = Accumulators(self.model, self.wanted, rows, self.held)
+        return found
 
 
 class ChunkAdjoint:
