@@ -175,6 +175,7 @@ def test_one_module_per_outside_world():
         own = (
             "autograd",
             "batches",
+            "energy_density",
             "oracle.moving",
             "oracle.step_limit",
             "oracle.stress",

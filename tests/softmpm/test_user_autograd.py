@@ -20,9 +20,10 @@ def built(law=softmpm.NeoHookean, **settings) -> softmpm.Model:
     return softmpm.build(scene, device="cpu", **{"dtype": torch.float64, **settings})
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # of torch.func.jvp itself
 @pytest.mark.parametrize("law", [softmpm.FixedCorotated, softmpm.BarrierCorotated])
 def test_a_second_derivative_of_the_energy_raises_where_it_is_not_known(law):
-    """An infinitesimal rotation would cost energy. First derivatives, also of a batch, agree with differences."""
+    """An infinitesimal rotation would cost energy. First derivatives, of a batch and forward too, agree with differences."""
     model = built(law)
     rest, params = model.rest(), model.params()
     random = torch.randn(rest.F.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -36,6 +37,12 @@ def test_a_second_derivative_of_the_energy_raises_where_it_is_not_known(law):
     step = 1e-6 * random
     difference = (energy(H.detach() + step) - energy(H.detach() - step)) / 2e-6
     assert (slope * random).sum().item() == pytest.approx(difference.item(), rel=1e-8)
+    batch = torch.stack([H.detach(), 2 * H.detach()])
+    rows = torch.vmap(torch.func.grad(energy))(batch)
+    for one, row in zip(batch, rows, strict=True):
+        torch.testing.assert_close(row, torch.func.grad(energy)(one))
+    (_, along) = torch.func.jvp(energy, (H.detach(),), (random,))
+    assert along.item() == pytest.approx((slope * random).sum().item(), rel=1e-10)
     (slope,) = torch.autograd.grad(energy(H), H, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivatives are not available"):
         slope.sum().backward()
