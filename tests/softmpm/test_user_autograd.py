@@ -17,7 +17,7 @@ def built(law=softmpm.NeoHookean, **settings) -> softmpm.Model:
     muscle = softmpm.Muscle(particles=range(len(block)), direction=(0.0, 1.0), strength=4.0)
     body = softmpm.Body(block, law(density=1.0, young=50.0, poisson=0.3))
     scene = softmpm.Scene(grid=GRID, bodies=[body], muscles=[muscle], gravity=(0.0, -1.0), dt=1e-4)
-    return softmpm.build(scene, device="cpu", **{"dtype": torch.float64, **settings})
+    return softmpm.build(scene, **{"device": "cpu", "dtype": torch.float64, **settings})
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # of torch.func.jvp itself
@@ -62,10 +62,10 @@ def test_a_second_derivative_of_the_energy_is_right_where_it_is_known():
 
 
 @pytest.mark.parametrize("name", ["x", "v", "C", "F"])
-def test_a_leaf_among_the_particles_of_nodes_is_refused(name):
+def test_a_leaf_among_the_particles_of_nodes_is_refused(name, device):
     """Also where the nodes have a history: their gradient would pass it by."""
-    model = built(formulation="reference")
-    young = torch.full((), 50.0, dtype=torch.float64, requires_grad=True)
+    model = built(formulation="reference", device=device)
+    young = torch.full((), 50.0, dtype=torch.float64, device=device, requires_grad=True)
     params = model.params()._replace(young=young)
     state = softmpm.simulate(model, model.rest(), None, params, substeps=2)
     leaf = getattr(state, name).detach().requires_grad_()
@@ -74,23 +74,25 @@ def test_a_leaf_among_the_particles_of_nodes_is_refused(name):
     softmpm.simulate(model, state, None, params, substeps=2)
 
 
-def test_forces_of_clamps_are_exact_under_autocast():
+def test_forces_of_clamps_are_exact_under_autocast(device):
     """As everything else that a model gives."""
     scene = built().scene
     scene = dataclasses.replace(scene, walls=[softmpm.Wall(normal=(1.0, 0.0), offset=0.3, contact="clamp")])
-    model = softmpm.build(scene, device="cpu", dtype=torch.float32, formulation="reference")
-    state = softmpm.simulate(model, model.rest(), torch.ones(1, 1, 1), model.params(), substeps=20)
+    model = softmpm.build(scene, device=device, dtype=torch.float32, formulation="reference")
+    state = softmpm.simulate(
+        model, model.rest(), torch.ones(1, 1, 1, device=device), model.params(), substeps=20
+    )
     want = softmpm.clamp_forces(model, state)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with torch.autocast(device, dtype=torch.bfloat16):
         found = softmpm.clamp_forces(model, state)
     assert found.dtype == torch.float32 and want.abs().max() > 0
     torch.testing.assert_close(found, want, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("formulation", ["moving", "reference"])
-def test_torch_func_differentiates_closed_loops(formulation):
+def test_torch_func_differentiates_closed_loops(formulation, device):
     """Calls that go on from others, whose states carry wrappers of the transform."""
-    model = built(formulation=formulation)
+    model = built(formulation=formulation, device=device)
     params = model.params()
 
     def loss(activation: torch.Tensor) -> torch.Tensor:
@@ -100,34 +102,36 @@ def test_torch_func_differentiates_closed_loops(formulation):
         film = softmpm.trajectory(model, state, activation, params, substeps=2)
         return film.end.x.square().sum() + softmpm.kinetic_energy(model, state, params).sum()
 
-    activation = torch.full((3, 1, 1), 0.3, dtype=torch.float64)
+    activation = torch.full((3, 1, 1), 0.3, dtype=torch.float64, device=device)
     found = torch.func.grad(loss)(activation)
     activation.requires_grad_()
     (want,) = torch.autograd.grad(loss(activation), activation)
-    torch.testing.assert_close(found, want, rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(found, want, rtol=1e-10, atol=1e-15)
     assert want.abs().max() > 0
 
 
 @pytest.mark.parametrize("formulation", ["moving", "reference"])
-def test_torch_compile_leaves_what_it_cannot_trace(formulation):
+def test_torch_compile_leaves_what_it_cannot_trace(formulation, device):
     """Energies of states with nodes, and states in Warp arrays."""
-    model = built(formulation=formulation)
+    model = built(formulation=formulation, device=device)
     params = model.params()
-    state = softmpm.simulate(model, model.rest(), torch.ones(1, 1, 1).double(), params, substeps=2)
+    state = softmpm.simulate(
+        model, model.rest(), torch.ones(1, 1, 1, dtype=torch.float64, device=device), params, substeps=2
+    )
 
     def work(state: softmpm.State) -> tuple[torch.Tensor, torch.Tensor]:
         energy = softmpm.kinetic_energy(model, state, params)
         return energy, softmpm.torch_state(model, softmpm.warp_state(model, state)).x
 
     found, want = torch.compile(work, backend="eager")(state), work(state)
-    assert all(torch.equal(one, other) for one, other in zip(found, want, strict=True))
+    torch.testing.assert_close(found, want, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("formulation", ["moving", "reference"])
-def test_a_loss_keeps_no_states_after_its_gradient(formulation, monkeypatch):
+def test_a_loss_keeps_no_states_after_its_gradient(formulation, device):
     """Whoever keeps losses for a curve would keep those of all iterations; with retain_graph they are needed again."""
-    model = built(formulation=formulation)
-    young = torch.full((), 50.0, dtype=torch.float64, requires_grad=True)
+    model = built(formulation=formulation, device=device)
+    young = torch.full((), 50.0, dtype=torch.float64, device=device, requires_grad=True)
     params = model.params()._replace(young=young)
 
     def loss() -> torch.Tensor:
@@ -145,7 +149,8 @@ def test_a_loss_keeps_no_states_after_its_gradient(formulation, monkeypatch):
     assert trails() == before
     again = loss()
     first, second = (torch.autograd.grad(again, young, retain_graph=keep)[0] for keep in (True, False))
-    assert torch.equal(first, second) and trails() == before
+    torch.testing.assert_close(first, second, rtol=1e-10, atol=0)  # sums are in any order on a GPU
+    assert trails() == before
     with pytest.raises(RuntimeError, match="second time"):
         again.backward()
 
