@@ -123,9 +123,14 @@ def coloured(
     if colour in ("muscle", "body"):
         bodies = (f"body {k}" for k in range(int(place.body.max()) + 1))
         names = place.actuators if colour == "muscle" else tuple(bodies)
+        if not names:
+            raise ValueError("colour 'muscle' needs a scene with muscles or pressures; take 'body'.")
         return Colouring("", of_names(names), names=names, with_fibres=with_fibres)
-    if limits is not None and not (np.isfinite(limits).all() and limits[0] < limits[1]):
-        raise ValueError(f"limits must be two numbers in ascending order, got {limits}.")
+    if limits is not None:
+        ends = [float(end) for end in limits]
+        if not (len(ends) == 2 and np.isfinite(ends).all() and ends[0] < ends[1]):
+            raise ValueError(f"limits must be two numbers in ascending order, got {limits}.")
+        limits = ends[0], ends[1]
     if colour == "activation":
         return Colouring(LABELS[colour], ACTIVATION, limits or (-1.0, 1.0), with_fibres=with_fibres)
     ramp = {"speed": SPEED, "strain": style.STRAIN, None: VALUES}[colour]

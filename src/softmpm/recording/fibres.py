@@ -61,7 +61,7 @@ class Fibres:
         count = 2 * int(np.ceil(LENGTH / (2 * RADIUS))) + 1  # dots overlap by a half
         shares, strokes = np.linspace(-0.5, 0.5, count)[:, None], [_none(count, place.dim)]
         for members, fibre in zip(place.muscle, place.fibre, strict=True):
-            if fibre.any():
+            if fibre.any() and members.any():  # of few recorded particles a muscle may have none
                 shown = members & seen if (members & seen).any() else members
                 middle = _spread(place.rest, np.flatnonzero(shown), gap)
                 line = place.rest[middle][:, None] + shares * LENGTH * gap * fibre / np.linalg.norm(fibre)

@@ -386,6 +386,7 @@ def test_a_figure_shows_itself_in_a_notebook(model):
         (dict(world=2), "world must be between 0 and 1"),
         (dict(world=()), "world must be between 0 and 1"),
         (dict(limits=(1.0, 0.0)), "ascending order"),
+        (dict(limits=np.array([0.0, 1.0, 2.0])), "limits must be two numbers"),
         (dict(axes=[]), "axes must be one for each world"),
     ],
 )
@@ -449,3 +450,14 @@ def test_any_style_leaves_letters_dark(model):
         own = Figure().subplots()
         softmpm.show(model, state, axes=own)
         assert same_color(own.xaxis.label.get_color(), "white")
+
+
+def test_muscles_of_a_scene_without_any_are_refused():
+    """In place of an error of NumPy's; limits may be an array or a tensor."""
+    model = softmpm.build(scene_of(muscles=[]), device="cpu")
+    with pytest.raises(
+        ValueError, match="colour 'muscle' needs a scene with muscles or pressures; take 'body'"
+    ):
+        softmpm.show(model, model.rest(), colour="muscle")
+    for limits in (np.array([0.0, 2.0]), torch.tensor([0.0, 2.0])):
+        assert softmpm.show(model, model.rest(), limits=limits).axes[-1].get_ylim() == (0.0, 2.0)

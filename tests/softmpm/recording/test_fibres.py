@@ -13,7 +13,7 @@ from scipy.ndimage import find_objects, label
 import softmpm
 from softmpm.pictures.colouring import CATEGORIES
 from softmpm.recording.fibres import DARK, LIGHT, Fibres, stroke_colours
-from softmpm.recording.surroundings import of_scene
+from softmpm.recording.surroundings import of_recording, of_scene
 
 RUBBER = softmpm.NeoHookean(density=1000.0, young=1e5, poisson=0.3)
 DIRECTION = {2: (math.cos(math.radians(30)), math.sin(math.radians(30))), 3: (0.0, 1.0, 0.0)}
@@ -160,3 +160,25 @@ def test_other_pictures_have_no_strokes(change):
     assert not angles(figure, LIGHT) and not angles(figure, DARK)
     legend = figure.axes[-1].get_legend()
     assert legend is None or not legend.get_title().get_text()
+
+
+def test_a_muscle_without_recorded_particles_has_no_strokes(tmp_path):
+    """Where only few of all are recorded."""
+    block = softmpm.box((0.2, 0.2), (0.8, 0.8), 0.05)
+    muscles = [softmpm.Muscle(particles=[k], direction=(1.0, 0.0), strength=1.0) for k in (0, len(block) - 1)]
+    scene = softmpm.Scene(
+        grid=softmpm.Grid(shape=(11, 11), spacing=0.1),
+        bodies=[softmpm.Body(block, RUBBER)],
+        muscles=muscles,
+        dt=1e-5,
+    )
+    model = softmpm.build(scene, device="cpu")
+    with (
+        softmpm.Recorder(tmp_path / "run.h5", model, max_particles=3) as recorder,
+        recorder.episode(0) as episode,
+    ):
+        episode.frame(0.0, model.rest(), torch.zeros(2))
+    with softmpm.Recording(tmp_path / "run.h5") as source:
+        assert not source.static["muscle"].any(axis=1).all()
+        shown = Fibres(of_recording(source), 0.1)
+    assert len(shown.particle) == source.static["muscle"].any(axis=1).sum()
