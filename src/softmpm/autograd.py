@@ -9,7 +9,14 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from softmpm.alarms import Failures
-from softmpm.batches import FirstOrder, FirstOrderAdjoint, kinds, refuse_batches, refuse_other_kinds
+from softmpm.batches import (
+    FirstOrder,
+    FirstOrderAdjoint,
+    keeps_graph,
+    kinds,
+    refuse_batches,
+    refuse_other_kinds,
+)
 from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_steps
 from softmpm.check_state import check_finite, check_state
 from softmpm.checks import check_activation, check_horizon
@@ -174,9 +181,6 @@ def cast(model: Model, value: Any) -> Any:
     return type(value)(*(cast(model, part) for part in value))
 
 
-_autograd: Any = torch._C._autograd  # pyright: ignore[reportAttributeAccessIssue]
-
-
 @dataclass(eq=False)
 class _Call:
     """Data of one call that are no tensors, which PyTorch would track; receives the trail for its backward pass.
@@ -271,7 +275,7 @@ class _SimulateBackward(FirstOrderAdjoint):
         adj_end = kind.of([torch.zeros_like(like) if adj is None else adj for adj, like in pairs])
         with explain_out_of_memory(call.model, call.horizon, gradient=True), at(call.place):
             adj, adj_inputs = rollout_adj(call.model, call.horizon, call.trail, values, adj_end, wanted)
-        if not _autograd._get_current_graph_task_keep_graph():
+        if not keeps_graph():
             call.trail = None  # PyTorch frees only what is saved with it, and refuses a second backward pass
         found = (adj_inputs.tensors.get(name) for name in call.names)
         exact = (

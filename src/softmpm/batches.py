@@ -40,8 +40,8 @@ class FirstOrder(torch.autograd.Function):
         raise RuntimeError(FORWARD)
 
 
-class FirstOrderAdjoint(FirstOrder):
-    """Base of the adjoint of such a function: a second derivative raises instead of silently losing this term."""
+class Adjoint(torch.autograd.Function):
+    """Base of the adjoint of a function: a second derivative raises instead of silently losing this term."""
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -50,6 +50,16 @@ class FirstOrderAdjoint(FirstOrder):
     @staticmethod
     def backward(ctx, *adj):
         raise RuntimeError(SECOND)
+
+
+class FirstOrderAdjoint(FirstOrder, Adjoint):
+    """Base of the adjoint of a :class:`FirstOrder` function."""
+
+
+def keeps_graph() -> bool:
+    """True if the backward pass that is running is to keep its graph for another one."""
+    core: Any = torch._C
+    return core._autograd._get_current_graph_task_keep_graph()
 
 
 def refuse_batches(tensors: Iterable[Tensor | None]) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from softmpm.batches import SECOND
+from softmpm.batches import Adjoint
 from softmpm.scene.materials import BarrierCorotated, FixedCorotated, Material, NeoHookean, StableNeoHookean
 
 _SQUARINGS = 20
@@ -96,25 +96,15 @@ class _Distance(torch.autograd.Function):
     @staticmethod
     def jvp(ctx, tangent):
         (H,) = ctx.saved_tensors
-        return 2 * ((H - rotation_change(H)) * tangent).sum((-2, -1))
+        return (_DistanceAdj.apply(H, torch.ones_like(H[..., 0, 0])) * tangent).sum((-2, -1))
 
 
-class _DistanceAdj(torch.autograd.Function):
-    """Raises where it would be differentiated: the derivative of the rotation would be missing."""
-
+class _DistanceAdj(Adjoint):
     generate_vmap_rule = True
 
     @staticmethod
     def forward(H: Tensor, adj: Tensor) -> Tensor:
         return 2 * adj[..., None, None] * (H - rotation_change(H))
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
-
-    @staticmethod
-    def backward(ctx, *adj):
-        raise RuntimeError(SECOND)
 
 
 def rotation_change(H: Tensor) -> Tensor:

@@ -43,6 +43,8 @@ def test_a_second_derivative_of_the_energy_raises_where_it_is_not_known(law):
         torch.testing.assert_close(row, torch.func.grad(energy)(one))
     (_, along) = torch.func.jvp(energy, (H.detach(),), (random,))
     assert along.item() == pytest.approx((slope * random).sum().item(), rel=1e-10)
+    with pytest.raises(RuntimeError, match="second derivatives are not available"):
+        torch.func.grad(lambda H: torch.func.jvp(energy, (H,), (random,))[1])(H.detach())
     (slope,) = torch.autograd.grad(energy(H), H, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivatives are not available"):
         slope.sum().backward()

@@ -53,17 +53,18 @@ class Horizon:
         """Number of substeps."""
         return self.control_steps * self.substeps
 
+    def _division(self, longest: int) -> tuple[int, int, int]:
+        """Length of a chunk, number of substeps that are divided into such, and how often: the whole call, or each control step."""
+        if self.substeps <= longest:
+            return self.substeps * (longest // self.substeps), self.total, 1
+        length = math.ceil(self.substeps / math.ceil(self.substeps / longest))
+        return length, self.substeps, self.control_steps
+
     def counted(self, longest: int) -> tuple[int, list[int]]:
         """Number of the :meth:`chunks`, and the length of each of their shapes, without building them."""
-        if self.substeps <= longest:
-            length, whole = self.substeps * (longest // self.substeps), self.total
-            times = 1
-        else:
-            length, whole = math.ceil(self.substeps / math.ceil(self.substeps / longest)), self.substeps
-            times = self.control_steps
+        length, whole, times = self._division(longest)
         full, rest = divmod(whole, length)
-        lengths = [length] * bool(full) + [rest] * bool(rest)
-        return times * (full + bool(rest)), lengths if times else []
+        return times * (full + bool(rest)), [length] * bool(full) + [rest] * bool(rest)
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - caches numbers, not simulated states
     def chunks(self, longest: int) -> tuple[Chunk, ...]:
@@ -71,13 +72,9 @@ class Horizon:
 
         The chunks have few distinct shapes, so that few chunk graphs are captured.
         """
-        if self.substeps <= longest:
-            length = self.substeps * (longest // self.substeps)
-            starts = range(0, self.total, length)
-            return tuple(Chunk(first, min(length, self.total - first), self.substeps) for first in starts)
-        length = math.ceil(self.substeps / math.ceil(self.substeps / longest))
+        length, whole, times = self._division(longest)
         return tuple(
-            Chunk(step * self.substeps + first, min(length, self.substeps - first), self.substeps)
-            for step in range(self.control_steps)
-            for first in range(0, self.substeps, length)
+            Chunk(part * whole + first, min(length, whole - first), self.substeps)
+            for part in range(times)
+            for first in range(0, whole, length)
         )
