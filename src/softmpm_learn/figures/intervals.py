@@ -10,8 +10,8 @@ import numpy as np
 RESAMPLES = 10_000
 LEVEL = 0.95
 FEWEST = 5
-"""Pairs below which no difference is marked as one: between equal settings an interval leaves zero out in 53 % of cases with two pairs,
-24 % with three, 14 % with five, 10 % with ten."""
+"""Pairs below which no difference is marked as one: the interval of normal numbers of mean zero left zero out in 49 % of cases with two
+pairs, 25 % with three, 16 % with five and 10 % with ten (1,500 trials)."""
 SEED = 0
 """Of the resampling, so that a table is the same each time."""
 
