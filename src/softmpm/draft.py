@@ -10,9 +10,10 @@ from pathlib import Path
 
 @contextmanager
 def draft(path: Path) -> Iterator[Path]:
-    """Another name beside a path, for the block to write; what is there at its end takes the place of the path.
+    """Path of a temporary file in the same folder, for the block to write. If the block succeeds, the file replaces ``path``; else it
+    is deleted, and ``path`` stays as it was.
 
-    The name is in no other program's use. A process that is killed leaves the unfinished file behind.
+    The name is random. A process that is killed leaves the temporary file behind.
 
     Raises:
         FileNotFoundError: There is no such folder.

@@ -83,7 +83,6 @@ def _clamp_forces(model: Model, state: State) -> Tensor:
         raise ValueError(
             "clamp_forces needs a state that simulate returned, got one without nodes or their reaction; simulate from it first."
         )
-    reaction = (
-        state.nodes.reaction.double()
-    )  # a product of matrices would be in half precision under autocast
+    # A product of matrices would be in half precision under autocast:
+    reaction = state.nodes.reaction.double()
     return (model.mirror.shares.double()[None] * reaction[:, None]).sum(dim=2).to(model.dtype)

@@ -20,8 +20,8 @@ def plain_operations() -> Iterator[None]:
     a step of an optimiser does not reach them; and what is made without a device is on the CPU."""
     elsewhere = torch.get_default_device().type != "cpu"
     with contextlib.ExitStack() as held:
-        for place in [torch.device("cpu")] if elsewhere else []:  # it slows every operation down
-            held.enter_context(place)
+        if elsewhere:  # a default device slows every operation down
+            held.enter_context(torch.device("cpu"))
         for kind in ("cpu", "cuda"):
             held.enter_context(torch.autocast(kind, enabled=False))
         yield

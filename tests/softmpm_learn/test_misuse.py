@@ -14,7 +14,7 @@ from torch import nn
 import softmpm
 from softmpm_learn import register, train
 from softmpm_learn.episode import need_model_of, run_episode
-from softmpm_learn.objective import Effort, Objective, Progress, Reach, Term, Tilt
+from softmpm_learn.objective import Objective, Reach, Term, Tilt
 from softmpm_learn.observe import Centroids, Observer
 from softmpm_learn.observer_check import check_observer
 from softmpm_learn.seeding import seeded
@@ -55,11 +55,10 @@ def test_weights_follow_from_the_seed_in_threads():
             found.append(torch.randn(4))
 
     threads = [threading.Thread(target=draw) for _ in range(2)]
-    for _ in range(1):
-        for one in threads:
-            one.start()
-        for one in threads:
-            one.join()
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
     assert all(torch.equal(one, want) for one in found)
 
 
@@ -115,9 +114,9 @@ class Spread(Term):
     of: str = "x"
 
     def value(self, path):
-        x = getattr(path, self.of)[self.window(path) if self.of != "activation" else self.steps(path)]
+        x = getattr(path, self.of)[self.window(path)]
         x -= x.mean(dim=2, keepdim=True)
-        return x[..., 0].square().mean(dim=(0, 2) if x.dim() == 4 else 0)
+        return x[..., 0].square().mean(dim=(0, 2))
 
 
 @pytest.mark.parametrize("of", ["x", "v"])
@@ -290,4 +289,3 @@ def test_a_loss_without_gradient_is_named(task, model, settings, tmp_path):
     blind = dataclasses.replace(task, objective=Objective(Counted()))
     with pytest.raises(ValueError, match=r"the objective has no gradient .* operations of PyTorch"):
         train.train(blind, model, dataclasses.replace(settings, observer=PLAIN), tmp_path)
-    assert Objective(Progress(), Effort()).names == ["progress", "effort"]

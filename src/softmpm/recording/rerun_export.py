@@ -6,7 +6,7 @@ simulations stands on ``time`` at the same fraction of the way between them, so 
 robots play.
 """
 
-import contextlib
+import os
 import warnings
 from pathlib import Path
 
@@ -84,11 +84,13 @@ def to_rerun(
 
 def _need_whole(place: Path, rrd: Path) -> None:
     """Raise OSError unless a Rerun file has its end, without which viewers refuse it: Rerun only logs that the disk was full."""
+    length, magic = _FOOTER
     size = place.stat().st_size if place.is_file() else 0
-    with contextlib.suppress(FileNotFoundError), open(place, "rb") as file:
-        file.seek(max(0, size - _FOOTER[0]))
-        if _FOOTER[1] in file.read():
-            return
+    if size >= length:
+        with open(place, "rb") as file:
+            file.seek(-length, os.SEEK_END)
+            if magic in file.read():
+                return
     raise OSError(
         f"{rrd} cannot be written: Rerun left an unfinished file of {size} bytes; is there room on the disk, and is Rerun switched on?"
     )

@@ -162,9 +162,8 @@ class Recorder:
         with room(self._file, size + (len(frames) - 1) * FURTHER_FRAME):
             for table, many in rows.items():
                 put(self._tables[table], self._count.get(table, first), np.stack(many))
-                if (
-                    table in self._count
-                ):  # before the index has its row, so that none is named twice after an interrupt
+                if table in self._count:
+                    # Before the index has its row, so that none is named twice after an interrupt:
                     self._count[table] += len(many)
         self._write("frame/index", np.array(index, FRAME))
         for frame in frames:

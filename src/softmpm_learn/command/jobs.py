@@ -96,10 +96,8 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
     except JobError as failure:
         if len(jobs) == 1 or isinstance(failure, RefusedError) or group.size > 1:
             losses = fail(jobs, failure, group, failed)
-            if group.size > 1:
-                raise SystemExit(
-                    1
-                ) from failure  # the processes may no longer be in step; the same command goes on
+            if group.size > 1:  # the processes may no longer be in step; the same command goes on
+                raise SystemExit(1) from failure
             return losses
         problem = str(failure)
     except (ValueError, OSError) as error:

@@ -77,10 +77,8 @@ class RunFiles:
         self.run, self.out, self._loggers = run, out, loggers or Loggers([], out)
         self._named = run.learner.replay.ids if run.learner else []
         tables = {"metrics.csv": metrics(run), "timing.csv": TIMING}
-        for (
-            name,
-            columns,
-        ) in tables.items():  # what is refused comes before anything is cut back to the checkpoint
+        # What is refused comes before anything is cut back to the checkpoint:
+        for name, columns in tables.items():
             kept(out / name, columns, seals.get(name))
         settings = {"task": run.task.name} | dataclasses.asdict(run.settings)
         self._loggers.open(run.iteration, seals.get("loggers", {}), settings)
