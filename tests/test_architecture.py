@@ -31,7 +31,7 @@ LAYERS = """
     driven_grid
     describe specification
     model
-    schemes
+    schemes wall_poses
     schemes.plain schemes.fast schemes.lagrangian recording
     schemes.registry material
     kernel_inputs choices
@@ -77,7 +77,7 @@ KNOWN = {
 }
 """Modules of schemes that others import."""
 OUTSIDE = {
-    "rerun": {"recording.rerun_export", "recording.rerun_blueprint"},
+    "rerun": {f"recording.rerun_{name}" for name in ("export", "blueprint", "walls")},
     "h5py": {f"recording.{name}" for name in ("format", "format_checks", "reader", "file", "writer")},
     "hydra": set(),
     "matplotlib": {"pictures.figure", "pictures.film", "pictures.panel"},

@@ -10,6 +10,7 @@ from softmpm.planning.chunks import Horizon
 from softmpm.schemes.inputs import Values
 from softmpm.schemes.lagrangian.driven import of_nodes
 from softmpm.state import Params, State
+from softmpm.wall_poses import POSES, wall_poses
 
 
 def derive(
@@ -30,7 +31,8 @@ def derive(
     found: Values = dict(zip(("mu", "lam", "mass"), material(model, params), strict=True))
     if model.spec.muscle_slots:
         found["active_stress"] = _active_stress(model, activation, given.get("strength"), horizon)
-    full = {name: expanded(model, name, value, horizon) for name, value in (model.defaults | given).items()}
+    others = {name: value for name, value in (model.defaults | given).items() if name not in POSES}
+    full = {name: expanded(model, name, value, horizon) for name, value in others.items()}
     for name, value in full.items():
         if name == "direction":
             found["fibre"] = value / value.norm(dim=-1, keepdim=True)
@@ -42,28 +44,22 @@ def derive(
             found["velocity"] = velocity_to(model, start, value, horizon)
         elif name == "wall_velocity":
             found["surface_velocity"] = value
-        elif name not in ("strength", "wall_offset", "wall_normal"):
+        elif name != "strength":
             found[name] = value
     if model.driven_grid is not None:
         found["driven_velocity"] = of_nodes(model, found["velocity"])
     if model.spec.moving:
-        length = full["wall_normal"].norm(dim=-1)
-        normal, offset = full["wall_normal"] / length[..., None], full["wall_offset"]
-        offset = offset / length if "wall_offset" in given else offset  # the scene's is of a unit normal
-        found |= _poses(model, offset, normal, horizon)
+        found |= _in_motion(model, given, horizon)
     return {name: found[name] for name in model.derived}
 
 
 def expanded(model: Model, name: str, value: Tensor, horizon: Horizon) -> Tensor:
-    """The input expanded to all of its axes, with the numbers of a vector side by side; a wall at rest retains its single pose."""
+    """The input expanded to all of its axes, with the numbers of a vector side by side."""
     if QUANTITIES[name].axes[-1] == "dim" and value.shape[-1:] != (model.dim,):
         value = value.expand(*value.shape[:-1], model.dim).contiguous()
     if QUANTITIES[name].axes[-1] == "dim" and value.stride(-1) != 1:
         value = value.contiguous()
-    shape = model.shape_of(name, horizon.control_steps)
-    if name in ("wall_offset", "wall_normal") and value.ndim == len(shape):
-        shape = (len(value), *shape[1:])
-    return value.expand(shape)
+    return value.expand(model.shape_of(name, horizon.control_steps))
 
 
 def velocity_to(model: Model, start: State, position: Tensor, horizon: Horizon) -> Tensor:
@@ -82,11 +78,11 @@ def _active_stress(
     return (activation * (model.strength if strength is None else strength)).contiguous()
 
 
-def _poses(model: Model, offset: Tensor, normal: Tensor, horizon: Horizon) -> Values:
-    """Pose of the walls at the beginning of each control step, and its rate of change (C4), from unit normals."""
+def _in_motion(model: Model, given: Values, horizon: Horizon) -> Values:
+    """Pose of the walls at the beginning of each control step, and its rate of change (C4)."""
     seconds, steps = horizon.substeps * model.scene.dt, horizon.control_steps
     found = {}
-    for name, pose in (("offset", offset), ("normal", normal)):
+    for name, pose in zip(("normal", "offset"), wall_poses(model, given), strict=True):
         still = len(pose) == 1
         rows = pose.expand(steps, *pose.shape[1:]) if still else pose[:-1]
         rate = torch.zeros_like(rows) if still else (pose[1:] - pose[:-1]) / seconds

@@ -10,14 +10,16 @@ import numpy as np
 from torch import Tensor
 
 from softmpm.check_state import check_state
+from softmpm.inputs import Inputs
 from softmpm.model import Model
 from softmpm.pictures.camera import Camera
 from softmpm.pictures.colouring import QUANTITIES, Colouring, coloured, values_of
-from softmpm.pictures.instant import Instant, array, at_rest, of_state
+from softmpm.pictures.instant import Instant, array, at_rest, framed, of_state
 from softmpm.pictures.panel import Panel
 from softmpm.recording.surroundings import Surroundings, of_scene
 from softmpm.scene.scene import Scene
 from softmpm.state import State
+from softmpm.wall_poses import given_poses
 
 WIDTH, TALLEST = 7.0, 6.0
 """Most width of a figure, and most height of its panels together [inch]."""
@@ -44,6 +46,7 @@ def show(
     *,
     colour: str | Tensor | np.ndarray | None = None,
     activation: Tensor | None = None,
+    inputs: Inputs | None = None,
     world: int | Sequence[int] = 0,
     limits: tuple[float, float] | None = None,
     label: str = "",
@@ -57,9 +60,9 @@ def show(
         softmpm.show(model, state, colour="strain").savefig("strain.png")
         softmpm.show(model, state, world=range(4))  # four worlds side by side
 
-    The figure shows itself in a notebook. Walls are drawn as the scene describes them; an arrow above the figure is the scale of their
-    tractions. Driven particles have dark edges. Over the colours "muscle" and "activation" strokes show the fibres of muscles, which
-    deform with the body; in 3D those at the surface. A 3D scene stands upright: against gravity, or without any with y up.
+    The figure shows itself in a notebook. An arrow above the figure is the scale of the walls' tractions. Driven particles have dark
+    edges. Over the colours "muscle" and "activation" strokes show the fibres of muscles, which deform with the body; in 3D those at
+    the surface. A 3D scene stands upright: against gravity, or without any with y up.
 
     Args:
         model: What ``state`` belongs to; a scene is drawn at rest.
@@ -68,6 +71,8 @@ def show(
             shape (particle,) or (world, particle). None takes the activation if it is given, else the speed, and of a scene at rest the
             muscles, or the bodies if there are none.
         activation: Activation [-], shape (muscle,) or (world, muscle).
+        inputs: Of the call that led to ``state``, of which a picture shows the walls at their last pose; None draws them where the
+            scene has them.
         world: The world to draw, or several, side by side.
         limits: Ends of the colour scale. None: -1 and 1 for the activation, 0 and the largest value for speed and strain, the lowest
             and the highest of an array.
@@ -86,7 +91,7 @@ def show(
     scene = model if isinstance(model, Scene) else model.scene
     place = of_scene(scene)
     worlds = _whole(world)
-    instants = _instants(model, state, activation, worlds)
+    instants = _instants(model, state, activation, inputs, worlds)
     if colour is None:
         at_work = "activation" if activation is not None else "speed"
         colour = at_work if state is not None else ("muscle" if scene.muscles else "body")
@@ -98,7 +103,7 @@ def show(
         values = _own(colour, worlds, len(place.rest))
     colouring = coloured(colour if isinstance(colour, str) else None, label, place, values, limits)
     titles = [f"world {k}" if len(worlds) > 1 else "" for k in worlds]
-    low, high = place.window(np.concatenate([instant.positions for instant in instants]))
+    low, high = framed(place, instants)
     figure, panels = panels_of(place, low, high, len(worlds), colouring, longest(instants), axes)
     for panel, instant, one, title in zip(panels, instants, values, titles, strict=True):
         panel.draw(instant, colouring.rgb(one), title)
@@ -116,9 +121,16 @@ def _whole(world: Any) -> tuple[int, ...]:
 
 
 def _instants(
-    model: Model | Scene, state: State | None, activation: Tensor | None, worlds: tuple[int, ...]
+    model: Model | Scene,
+    state: State | None,
+    activation: Tensor | None,
+    inputs: Inputs | None,
+    worlds: tuple[int, ...],
 ) -> list[Instant]:
     """Instant of each world that is drawn."""
+    for name, value in {"activation": activation, "inputs": inputs}.items():
+        if state is None and value is not None:
+            raise ValueError(f"{name} belongs to a state; of a model at rest that is model.rest().")
     if state is None:
         scene = model if isinstance(model, Scene) else model.scene
         return [at_rest(scene)] * len(worlds)
@@ -135,7 +147,9 @@ def _instants(
             f"activation must have shape {shapes[0]} or {shapes[1]}, got {tuple(activation.shape)}; a picture is one instant, so of "
             "many control steps it takes one."
         )
-    return [of_state(model, state, activation, k) for k in worlds]
+    poses = given_poses(model, inputs)
+    pose = None if poses is None else (poses[0][-1], poses[1][-1])
+    return [of_state(model, state, activation, k, pose) for k in worlds]
 
 
 def _own(colour: Tensor | np.ndarray, worlds: tuple[int, ...], count: int) -> list[np.ndarray]:

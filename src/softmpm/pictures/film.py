@@ -1,8 +1,7 @@
 """to_video: a recording, or the states of a simulation, as a GIF or an MP4."""
 
-import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,22 +11,21 @@ from torch import Tensor
 
 from softmpm.check_state import check_state
 from softmpm.draft import draft
+from softmpm.inputs import Inputs
 from softmpm.model import Model, check_model
 from softmpm.pictures.colouring import QUANTITIES, coloured, values_of
+from softmpm.pictures.encoders import WRITERS
 from softmpm.pictures.figure import longest, panels_of
-from softmpm.pictures.instant import Instant, of_state, recorded
+from softmpm.pictures.instant import Instant, Pose, framed, of_state, recorded
 from softmpm.recording.reader import Recording
 from softmpm.recording.surroundings import Surroundings, of_recording, of_scene
 from softmpm.state import State
+from softmpm.wall_poses import given_poses
 
 DPI = 100
 """Pixels per inch: a film is 700 pixels wide, and wider with names of colours."""
 MOST_OF_A_GIF = 50
 """Pictures per second: viewers slow down shorter ones than two hundredths of a second."""
-
-FAILED = "ffmpeg could not write the film, perhaps for want of room on the disk"
-EXACT = 128
-"""Colours of a picture of a GIF that are exact, of 256; the others are covered by the rest."""
 
 
 def to_video(
@@ -36,6 +34,7 @@ def to_video(
     *,
     model: Model | None = None,
     activation: Tensor | None = None,
+    inputs: Inputs | None = None,
     period: float | None = None,
     iteration: int | None = None,
     world: int = 0,
@@ -56,6 +55,8 @@ def to_video(
         path: File to write, ``.gif`` or ``.mp4`` (``pip install "softmpm[video]"``). An older one is replaced.
         model: What the states belong to.
         activation: Activation [-] of each state, shape (state, world, muscle).
+        inputs: ``wall_offset`` and ``wall_normal`` of these are the pose of the walls at each state, shapes (state, world, wall) and
+            (state, world, wall, dim), or one for all states. None draws the walls where the scene has them.
         period: Simulated time between two states [s]; None shows each state in one picture.
         iteration: Recorded simulation to show; None is the last.
         world: The world of the states to show.
@@ -86,7 +87,7 @@ def to_video(
     if colour is not None and colour not in QUANTITIES:
         raise ValueError(f"colour must be one of {', '.join(QUANTITIES)}, got {colour!r}.")
     if isinstance(source, (str, Path, Recording)):
-        given = dict(model=model, activation=activation, period=period, world=world or None)
+        given = dict(model=model, activation=activation, inputs=inputs, period=period, world=world or None)
         foreign = [name for name, value in given.items() if value is not None]
         if foreign:
             raise ValueError(f"{foreign[0]} belongs to a film of states; a recording has its own.")
@@ -96,7 +97,7 @@ def to_video(
     elif isinstance(source, Recording):
         place, instants = _of_recording(source, iteration, fps, rate)
     else:
-        place, instants = _of_states(_listed(source), model, activation, world, period, fps, rate)
+        place, instants = _of_states(_listed(source), model, activation, inputs, world, period, fps, rate)
     with draft(path) as film:
         WRITERS[path.suffix.lower()](film, _pictures(place, instants, colour, limits), fps)
     return path
@@ -145,6 +146,7 @@ def _of_states(
     states: list[State],
     model: Model | None,
     activation: Tensor | None,
+    inputs: Inputs | None,
     world: int,
     period: float | None,
     fps: float,
@@ -161,13 +163,30 @@ def _of_states(
         raise ValueError(
             f"activation must have shape {shape}, one row for each state, got {tuple(activation.shape)}."
         )
+    poses = _poses(model, inputs, len(states))
     step = rate / fps if period is None else period
     found = {}
     chosen = resampled(step * np.arange(len(states)), fps, rate)
     for k in np.unique(chosen):
-        one = of_state(model, states[k], None if activation is None else activation[k], world)
+        one = of_state(model, states[k], None if activation is None else activation[k], world, poses[k])
         found[k] = replace(one, time=None if period is None else k * step)
     return of_scene(model.scene), [found[k] for k in chosen]
+
+
+def _poses(model: Model, inputs: Inputs | None, count: int) -> list[Pose | None]:
+    """Pose of the walls at each state."""
+    found = given_poses(model, inputs)
+    if found is None:
+        return [None] * count
+    if len(found[0]) not in (1, count):
+        raise ValueError(
+            f"inputs must have one pose of the walls for each of the {count} states, or one for all, got {len(found[0])}; the frames "
+            "of a trajectory follow each control step, so for them leave out the first pose: inputs.wall_offset[1:]."
+        )
+    return [
+        (normal, offset)
+        for normal, offset in zip(*(v.expand(count, *v.shape[1:]) for v in found), strict=True)
+    ]
 
 
 def resampled(time: np.ndarray, fps: float, rate: float) -> np.ndarray:
@@ -186,7 +205,7 @@ def _pictures(
         colour = "activation" if has else "speed"
     values = [values_of(colour, place, instant) for instant in instants]
     colouring = coloured(colour, "", place, values, limits)
-    low, high = place.window(np.concatenate([instant.positions for instant in instants]))
+    low, high = framed(place, instants)
     figure, (panel,) = panels_of(place, low, high, 1, colouring, longest(instants))
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -206,74 +225,3 @@ def _pictures(
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3]
         yield pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]  # MP4 needs even sizes
-
-
-def _quantised(picture: np.ndarray) -> Any:
-    """The picture in 256 colours. The most frequent ones are exact, so that plain areas do not change from picture to picture."""
-    from PIL import Image
-
-    packed, places, counts = np.unique(
-        picture @ np.array([1 << 16, 1 << 8, 1]), return_inverse=True, return_counts=True
-    )
-    colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=1).astype(np.uint8)
-    order = np.argsort(-counts, kind="stable")
-    palette, others = colours[order[:EXACT]], colours[order[EXACT:]]
-    if len(others):  # the median cut would lose the colours of small things, such as arrows
-        covered = Image.fromarray(others[None]).quantize(256 - EXACT, Image.Quantize.MAXCOVERAGE)
-        palette = np.concatenate([palette, np.reshape(covered.getpalette() or [], (-1, 3))]).astype(np.uint8)
-    one, other = colours.astype(float), palette.astype(float)
-    nearest = (np.square(other).sum(axis=1) - 2 * one @ other.T).argmin(axis=1).astype(np.uint8)
-    image = Image.fromarray(nearest[places].reshape(picture.shape[:2]))
-    image.putpalette(palette.tobytes())
-    return image
-
-
-def _write_gif(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
-    frames = [_quantised(picture) for picture in pictures]
-    ends = [round(100 * k / fps) for k in range(len(frames) + 1)]  # a GIF counts in hundredths of a second
-    lasting = [10 * (end - begin) for begin, end in itertools.pairwise(ends)]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=lasting, loop=0)
-
-
-def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: int) -> None:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ImportError(
-            'an MP4 needs the package imageio-ffmpeg: pip install "softmpm[video]". A .gif needs no further package.'
-        ) from error
-    writer, sent = None, 0
-    try:
-        for picture in pictures:
-            if writer is None:
-                size = (picture.shape[1], picture.shape[0])
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error"
-                )
-                writer.send(None)
-            writer.send(np.ascontiguousarray(picture))
-            sent += 1
-    except BrokenPipeError as error:
-        raise OSError(f"{FAILED}, of which {sent} pictures were sent.") from error
-    finally:
-        if writer is not None:
-            writer.close()
-    _need_whole(path, sent)
-
-
-def _need_whole(path: Path, sent: int) -> None:
-    """Raise OSError unless a film has all pictures: where the disk is full, ffmpeg may end without an error."""
-    import imageio_ffmpeg
-
-    try:
-        written = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
-    except RuntimeError:
-        written = 0
-    if written != sent:
-        raise OSError(f"{FAILED}: it has {written} of {sent} pictures.")
-
-
-WRITERS: dict[str, Callable[[Path, Iterable[np.ndarray], int], None]] = {
-    ".gif": _write_gif,
-    ".mp4": _write_mp4,
-}

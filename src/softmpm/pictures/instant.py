@@ -1,6 +1,6 @@
 """The moving part of a picture: one world at one instant, of a state or of a recorded simulation. NumPy arrays."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +9,14 @@ from torch import Tensor
 
 from softmpm.forces import contact_forces
 from softmpm.model import Model
+from softmpm.recording.frame_values import strain
 from softmpm.recording.reader import Recording
-from softmpm.recording.writer import strain
+from softmpm.recording.surroundings import Surroundings
 from softmpm.scene.scene import Scene
 from softmpm.state import State
+
+Pose = tuple[Tensor, Tensor]
+"""Normals, shape (world, wall, dim), and offsets [m], shape (world, wall), of all walls."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,10 @@ class Instant:
     """Of the separating walls at these points [Pa], shape (wall, point, dim)."""
     time: float | None = None
     """[s], as recorded."""
+    normals: np.ndarray | None = None
+    """Of all walls, shape (wall, dim); None where they stand as in the scene."""
+    offsets: np.ndarray | None = None
+    """Of all walls [m], shape (wall,), likewise."""
 
 
 def at_rest(scene: Scene) -> Instant:
@@ -45,7 +53,9 @@ def at_rest(scene: Scene) -> Instant:
     return Instant(positions, still, still, places=places)
 
 
-def of_state(model: Model, state: State, activation: Tensor | None, world: int) -> Instant:
+def of_state(
+    model: Model, state: State, activation: Tensor | None, world: int, pose: Pose | None = None
+) -> Instant:
     """One world of a state, with its surface points and the tractions there if the state has them."""
     x, v, F = (array(tensor[world]) for tensor in (state.x, state.v, state.F))
     places = traction = None
@@ -53,6 +63,7 @@ def of_state(model: Model, state: State, activation: Tensor | None, world: int) 
         with torch.no_grad():
             forces = contact_forces(model, state)
         places, traction = array(forces.points[world]), array(forces.traction[world])
+    normals, offsets = (None, None) if pose is None else (array(values[world]) for values in pose)
     if activation is not None:
         activation = activation if activation.ndim == 1 else activation[world]
     return Instant(
@@ -62,14 +73,32 @@ def of_state(model: Model, state: State, activation: Tensor | None, world: int) 
         activation=None if activation is None else array(activation),
         places=places,
         traction=traction,
+        normals=normals,
+        offsets=offsets,
     )
+
+
+def framed(place: Surroundings, instants: Sequence[Instant]) -> tuple[np.ndarray, np.ndarray]:
+    """Box to frame [m]: around the particles of some instants, with the walls that are near, wherever these have been."""
+    walls = [(np.column_stack(walls_of(place, instant))) for instant in instants]
+    each = np.unique(np.concatenate(walls), axis=0)
+    return place.window(
+        np.concatenate([instant.positions for instant in instants]), each[:, :-1], each[:, -1]
+    )
+
+
+def walls_of(place: Surroundings, instant: Instant) -> tuple[np.ndarray, np.ndarray]:
+    """Normals and offsets of the walls at an instant."""
+    if instant.normals is None or instant.offsets is None:
+        return place.normals, place.offsets
+    return instant.normals, instant.offsets
 
 
 def recorded(recording: Recording, rows: np.ndarray) -> Iterator[Instant]:
     """Frames of one recorded simulation."""
     for row in rows[:, None]:
         found = {name: recording.read(name, row)[1] for name in ("time", "x", "v", "strain", "activation")}
-        parts = {name: recording.read(name, row)[1] for name in ("places", "traction")}
+        parts = {name: recording.read(name, row)[1] for name in ("places", "traction", "normals", "offsets")}
         activation = found["activation"][0]
         yield Instant(
             positions=found["x"][0].astype(float),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from softmpm.pictures.camera import Camera, round_below, round_length, tiles
-from softmpm.pictures.instant import Instant
+from softmpm.pictures.instant import Instant, walls_of
 from softmpm.recording import style
 from softmpm.recording.fibres import STROKES, Fibres, stroke_colours
 from softmpm.recording.surroundings import Surroundings
@@ -49,7 +49,7 @@ class Panel:
         self._moving: list[Any] = []
         self._camera = Camera(low, high, place.up) if place.dim == 3 else None
         corners = (low, high) if self._camera is None else self._camera.frame(low, high)
-        self._draw_walls(low, high)
+        self._low, self._high = low, high
         axes.set(xlim=(corners[0][0], corners[1][0]), ylim=(corners[0][1], corners[1][1]), aspect="equal")
         axes.set_facecolor("white")
         if self._camera is None:
@@ -70,6 +70,7 @@ class Panel:
         for artist in self._moving:
             artist.remove()
         self._moving = []
+        self._draw_walls(*walls_of(self._place, instant))
         x, radii, edge = instant.positions, self._place.radii, self._place.driven
         if self._camera is not None:
             rgb = rgb * self._camera.shading(self._place, x)[:, None]
@@ -166,30 +167,30 @@ class Panel:
         look |= dict(path_effects=[edge])
         return self._axes.quiver(*feet.T, *vectors.T, color=[tuple(np.array(style.TRACTION) / 255)], **look)
 
-    def _draw_walls(self, low: np.ndarray, high: np.ndarray) -> None:
-        place = self._place
-        outlines = style.wall_outlines(place.normals, place.offsets, place.upper)
-        for k, outline in enumerate(outlines):
-            colour = tuple(np.array(style.WALL[place.contacts[k]]) / 255)
-            if len(outline) < place.dim:
+    def _draw_walls(self, normals: np.ndarray, offsets: np.ndarray) -> None:
+        outlines = style.wall_outlines(normals, offsets, self._place.upper)
+        for contact, normal, offset, outline in zip(
+            self._place.contacts, normals, offsets, outlines, strict=True
+        ):
+            colour = tuple(np.array(style.WALL[contact]) / 255)
+            if len(outline) < self._place.dim:
                 continue
             if self._camera is None:
-                self._draw_line_wall(k, outline, colour, low, high)
+                self._moving += self._line_wall(normal, float(offset), outline, colour)
             else:
                 for axis, sign in ((axis, sign) for axis in range(3) for sign in (1.0, -1.0)):
-                    limit = low[axis] if sign > 0 else -high[axis]
+                    limit = self._low[axis] if sign > 0 else -self._high[axis]
                     outline = style.clip(outline, sign * np.eye(3)[axis], limit)
                 if len(outline) >= 3:
-                    self._draw_plane_wall(k, outline, colour, float((high - low).max()))
+                    behind = float(self._camera.position @ normal) > offset
+                    self._moving += self._plane_wall(self._camera, behind, outline, colour)
 
-    def _draw_line_wall(
-        self, k: int, outline: np.ndarray, colour: tuple, low: np.ndarray, high: np.ndarray
-    ) -> None:
-        """A wall of a 2D scene: its solid side, surface and hatching."""
+    def _line_wall(self, normal: np.ndarray, offset: float, outline: np.ndarray, colour: tuple) -> list[Any]:
+        """A wall of a 2D scene: its solid side, hatching and surface."""
         from matplotlib.collections import LineCollection
         from matplotlib.patches import Polygon
 
-        normal, offset = self._place.normals[k], self._place.offsets[k]
+        low, high, drawn = self._low, self._high, []
         room = high - low
         box = np.array(
             [
@@ -201,34 +202,28 @@ class Panel:
         )
         solid = style.clip(box, -normal, -offset)
         if len(solid) >= 3:
-            self._axes.add_patch(
-                Polygon(
-                    solid, facecolor=tuple(1.0 - 0.11 * (1.0 - np.array(colour))), edgecolor="none", zorder=0
-                )
-            )
-        strokes = style.hatch(outline, normal, float(room.max()) / 50)
-        self._axes.add_collection(
-            LineCollection(list(strokes), colors=[(*colour, 0.7)], linewidths=0.8, zorder=1), autolim=False
-        )
-        self._axes.plot(*outline.T, color=colour, linewidth=1.6, zorder=1, solid_capstyle="butt")
+            pale = tuple(1.0 - 0.11 * (1.0 - np.array(colour)))
+            drawn.append(self._axes.add_patch(Polygon(solid, facecolor=pale, edgecolor="none", zorder=0)))
+        strokes = list(style.hatch(outline, normal, float(room.max()) / 50))
+        lines = LineCollection(strokes, colors=[(*colour, 0.7)], linewidths=0.8, zorder=1)
+        look: dict = dict(color=colour, linewidth=1.6, zorder=1, solid_capstyle="butt")
+        return [*drawn, self._axes.add_collection(lines, autolim=False), *self._axes.plot(*outline.T, **look)]
 
-    def _draw_plane_wall(self, k: int, outline: np.ndarray, colour: tuple, extent: float) -> None:
+    def _plane_wall(self, camera: Camera, behind: bool, outline: np.ndarray, colour: tuple) -> list[Any]:
         """A wall of a 3D scene, tiled; where it stands between the camera and the bodies, only its edge."""
         from matplotlib.collections import LineCollection
         from matplotlib.patches import Polygon
 
-        assert self._camera is not None
-        behind = float(self._camera.position @ self._place.normals[k]) > self._place.offsets[k]
-        corners, _ = self._camera.project(outline)
+        corners, _ = camera.project(outline)
         face = (*colour, 0.22) if behind else "none"
         edge = Polygon(corners, facecolor=face, edgecolor=colour, linewidth=1.0, zorder=0 if behind else 3)
-        self._axes.add_patch(edge)
+        drawn: list[Any] = [self._axes.add_patch(edge)]
         if behind:
-            ends = self._camera.project(tiles(outline, round_length(extent)).reshape(-1, 3))[0]
-            lines = LineCollection(
-                list(ends.reshape(-1, 2, 2)), colors=[(*colour, 0.6)], linewidths=0.6, zorder=1
-            )
-            self._axes.add_collection(lines, autolim=False)
+            length = round_length(float((self._high - self._low).max()))
+            ends = camera.project(tiles(outline, length).reshape(-1, 3))[0].reshape(-1, 2, 2)
+            lines = LineCollection(list(ends), colors=[(*colour, 0.6)], linewidths=0.6, zorder=1)
+            drawn.append(self._axes.add_collection(lines, autolim=False))
+        return drawn
 
     def _draw_axes(self, low: np.ndarray, high: np.ndarray) -> None:
         """Arrows along x, y and z in the lower left corner, and the length of tiles and arrows."""

@@ -2,8 +2,8 @@
 
     episode           {iteration, attributes}       one row per recorded simulation
     scalar            {iteration, name, value}      one row per number, such as a loss
-    frame/index       {episode, time, field, latent, force, traction, places}
-                                                    one row per frame; its rows of the last five tables, or -1
+    frame/index       {episode, time, field, latent, force, traction, places, normals, offsets}
+                                                    one row per frame; its rows of the last seven tables, or -1
     frame/x, frame/v  (frame, particle, dim)        [m], [m/s]
     frame/strain      (frame, particle)             size of the Green strain [-], see writer.py
     frame/activation  (frame, muscle)               [-], NaN where none was given
@@ -12,10 +12,12 @@
     force/total       (row, wall, dim)              force of each separating wall [N]
     force/traction    (row, wall, point, dim)       force per area at rest at surface points [Pa]
     force/places      (row, point, dim)             where these points are [m]
+    wall/normals      (row, wall, dim)              of all walls, where they are not those of the scene
+    wall/offsets      (row, wall)                   likewise [m]
     static/*                                        rest shape, muscles, walls, surface points
 
 A row of a table with names is complete when its first number is not negative; HDF5 shows the fill value -1
-until then. Version 1 has no forces and no surface points, and before version 3 muscles have no names.
+until then. Version 1 has no forces and no surface points, before version 3 muscles have no names, and before version 4 walls no poses.
 """
 
 from typing import cast
@@ -27,12 +29,17 @@ from softmpm.model import Model
 from softmpm.scene.actuators import LONGEST_NAME
 from softmpm.scene.scene import CONTACTS
 
-FORMAT, VERSION = "softmpm recording", 3
+FORMAT, VERSION = "softmpm recording", 4
 EPISODE = np.dtype([("iteration", "<i8"), ("attributes", "S4096")])
 SCALAR = np.dtype([("iteration", "<i8"), ("name", "S64"), ("value", "<f8")])
 _FIRST_FRAME = [("episode", "<i8"), ("time", "<f8"), ("field", "<i8"), ("latent", "<i8")]
-FRAME = np.dtype([*_FIRST_FRAME, ("force", "<i8"), ("traction", "<i8"), ("places", "<i8")])
-FRAMES = {1: np.dtype(_FIRST_FRAME), 2: FRAME, 3: FRAME}
+_WITH_FORCES = [*_FIRST_FRAME, ("force", "<i8"), ("traction", "<i8"), ("places", "<i8")]
+FRAME = np.dtype([*_WITH_FORCES, ("normals", "<i8"), ("offsets", "<i8")])
+FRAMES = {
+    1: np.dtype(_FIRST_FRAME),
+    **dict.fromkeys((2, 3), np.dtype(_WITH_FORCES)),
+    4: FRAME,
+}
 """Rows of ``frame/index`` by version."""
 REAL, INDEX = np.dtype("<f4"), np.dtype("<i8")
 Layout = tuple[np.dtype, str]
@@ -70,11 +77,14 @@ TABLES = {  # as above; r rows, n the nodes of the grid (dim axes), l the size o
     "force/total": (REAL, "rkd"),
     "force/traction": (REAL, "rksd"),
     "force/places": (REAL, "rsd"),
+    "wall/normals": (REAL, "rwd"),
+    "wall/offsets": (REAL, "rw"),
 }
 SINCE = {
     **dict.fromkeys(("surface_wall", "surface_point", "surface_area"), 2),
     **dict.fromkeys(("force/total", "force/traction", "force/places"), 2),
     "muscle_name": 3,
+    **dict.fromkeys(("wall/normals", "wall/offsets"), 4),
 }
 """Version since which files have a name of :data:`STATIC` or :data:`TABLES`; others have been there from the first."""
 PER_FRAME = ("x", "v", "strain", "activation")
@@ -84,6 +94,8 @@ PARTS = {
     "force": "force/total",
     "traction": "force/traction",
     "places": "force/places",
+    "normals": "wall/normals",
+    "offsets": "wall/offsets",
 }
 """Tables with a row only for the frames that have one."""
 _LATENT_CHUNK, _LATENT_MOST = 64, 65536
@@ -148,6 +160,7 @@ def create(file: h5py.File, model: Model, static: dict[str, np.ndarray]) -> None
         "d": (grid.dim,),
         "m": (len(model.scene.muscles),),
         "n": tuple(grid.shape),
+        "w": static["wall_offset"].shape,
         "k": static["surface_wall"].shape,
         "s": static["surface_point"].shape,
     }

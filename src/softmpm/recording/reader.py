@@ -51,7 +51,7 @@ class Recording:
             ``wall_normal``, ``grid_shape``, ``surface_wall`` (number of each separating wall in the scene),
             ``surface_point`` (the model's index of each recorded surface point), ``surface_area`` [m²], ...
         muscle_names: Labels of the muscles and pressures, as of :attr:`softmpm.Scene.muscle_names`.
-        version: Of the format: 3; 2, which has no names of muscles; or 1, which has no forces either.
+        version: Of the format: 4; 3, which has no poses of walls; 2, which has no names of muscles either; or 1, without forces.
         dt, spacing: Substep [s] and grid spacing [m].
         share: Part of the model's particles that was recorded, 1 for all.
         episodes: Iterations of the recorded simulations, in the order of the run.
@@ -211,7 +211,7 @@ class Recording:
         return rows[self._frame[name][rows] >= 0] if name in PARTS else rows
 
     def read(self, name: str, rows: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """One quantity, ``time x v strain activation field latent force traction places``, at some frames.
+        """One quantity, ``time x v strain activation field latent force traction places normals offsets``, at some frames.
 
         Returns:
             Those of ``rows`` at which it was recorded, and its values there, with a first axis of rows.
@@ -251,9 +251,10 @@ class Recording:
         Returns:
             ``time`` (frame,) [s], ``x`` and ``v`` (frame, particle, dim), ``strain`` (frame, particle),
             ``activation`` (frame, muscle); and where they were recorded ``field`` (row, *nodes, dim),
-            ``latent`` (row, size), and of the separating walls ``force`` (row, wall, dim) [N], ``traction``
-            (row, wall, point, dim) [Pa] and ``places`` of the surface points (row, point, dim) [m], each with
-            ``field_frame`` and so on (row,), the frame that each row belongs to.
+            ``latent`` (row, size), of the separating walls ``force`` (row, wall, dim) [N], ``traction``
+            (row, wall, point, dim) [Pa] and ``places`` of the surface points (row, point, dim) [m], and of all walls that are not
+            where the scene has them ``normals`` (row, wall, dim) and ``offsets`` (row, wall) [m], each with ``field_frame`` and so on
+            (row,), the frame that each row belongs to.
         """
         rows = self.rows(iteration)
         out = {name: self.read(name, rows)[1] for name in ("time", *PER_FRAME)}

@@ -1,5 +1,5 @@
-"""Blueprint of a Rerun file: its views, their titles, and the entity paths that views and data share. Only this module and
-:mod:`softmpm.recording.rerun_export` import rerun.
+"""Blueprint of a Rerun file: its views, their titles, and the entity paths that views and data share. Only this module,
+:mod:`softmpm.recording.rerun_export` and :mod:`softmpm.recording.rerun_walls` import rerun.
 """
 
 from softmpm.recording import style

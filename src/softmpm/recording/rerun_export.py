@@ -18,6 +18,7 @@ from softmpm.recording import style
 from softmpm.recording.fibres import DARK, STROKES, Fibres
 from softmpm.recording.reader import Recording
 from softmpm.recording.rerun_blueprint import blueprint, curve
+from softmpm.recording.rerun_walls import send_walls
 from softmpm.recording.selection import Show, Simulation, plan
 from softmpm.recording.surroundings import of_recording
 
@@ -117,7 +118,9 @@ def _log_static(stream, source: Recording, show: Show) -> None:
     radii = style.radii(source.static["volume"][show.particle], shown, source.dim)
     for name in ("activation", "strain"):
         stream.log(f"scene/robot/{name}", points.from_fields(radii=radii), static=True)
-    _log_walls(stream, source)
+    if not show.has["offsets"]:
+        walls = of_recording(source)
+        send_walls(stream, source, [], walls.normals[None], walls.offsets[None])
     if source.muscle_names:
         stream.log("activation", rr.SeriesLines(names=source.muscle_names), static=True)
     if show.has["force"]:
@@ -135,32 +138,6 @@ def _log_look_of_fibres(stream, source: Recording, fibres: Fibres) -> None:
     if source.dim == 2:
         look["draw_order"] = 35.0  # between particles and tractions
     stream.log("scene/robot/fibres", _strips(source).from_fields(**look), static=True)
-
-
-def _log_walls(stream, source: Recording) -> None:
-    import rerun as rr
-
-    static = source.static
-    normals, offsets = static["wall_normal"].astype(float), static["wall_offset"].astype(float)
-    outlines = style.wall_outlines(normals, offsets, (static["grid_shape"] - 1) * source.spacing)
-    for k, (outline, normal) in enumerate(zip(outlines, normals, strict=True)):
-        colour = style.WALL.get(static["wall_contact"][k], style.WALL[b"stick"])
-        if len(outline) < source.dim:
-            continue
-        if source.dim == 2:
-            strokes = style.hatch(outline, normal, 2 * source.spacing)
-            lines = rr.LineStrips2D(
-                [outline, *strokes], colors=[colour], radii=0.12 * source.spacing, draw_order=0
-            )
-            stream.log(f"scene/walls/{k}", lines, static=True)
-        else:
-            fan = np.array([(0, i, i + 1) for i in range(1, len(outline) - 1)])
-            sheet = rr.Mesh3D(vertex_positions=outline, triangle_indices=fan, albedo_factor=(*colour, 70))
-            edge = rr.LineStrips3D(
-                [np.vstack([outline, outline[:1]])], colors=[colour], radii=0.15 * source.spacing
-            )
-            stream.log(f"scene/walls/{k}", sheet, static=True)
-            stream.log(f"scene/walls/{k}/edge", edge, static=True)
 
 
 def _times(simulation: Simulation, at: np.ndarray):
@@ -199,6 +176,8 @@ def _log_simulation(stream, source: Recording, show: Show, simulation: Simulatio
             _send_series(stream, "activation", _times(simulation, at), activation)
         _log_fields(stream, source, show, simulation, at)
         _log_forces(stream, source, show, simulation, at)
+        if show.has["offsets"]:
+            _log_poses(stream, source, simulation, at)
         have, latent = source.read("latent", rows[at])
         if len(have):
             _send_series(stream, "latent", _times(simulation, np.searchsorted(rows, have)), latent)
@@ -252,6 +231,18 @@ def _log_forces(stream, source: Recording, show: Show, simulation: Simulation, a
         columns = _arrows(source).columns(origins=origins, vectors=vectors)
         lengths = [len(origins) for origins, _ in arrows]
         stream.send_columns("scene/traction", _times(simulation, at), columns.partition(lengths))
+
+
+def _log_poses(stream, source: Recording, simulation: Simulation, at: np.ndarray) -> None:
+    """Walls in each frame; in frames without a pose of their own where the scene has them."""
+    place, rows = of_recording(source), simulation.rows[at]
+    normals, offsets = (
+        np.tile(values, (len(at), *[1] * values.ndim)) for values in (place.normals, place.offsets)
+    )
+    for name, values in (("normals", normals), ("offsets", offsets)):
+        have, found = source.read(name, rows)
+        values[np.searchsorted(rows, have)] = found
+    send_walls(stream, source, _times(simulation, at), normals, offsets)
 
 
 def _arrows(source: Recording):

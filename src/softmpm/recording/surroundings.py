@@ -69,14 +69,16 @@ class Surroundings:
             found[own] = np.where(near < len(own), own[np.minimum(near, len(own) - 1)], own[:, None])
         return found
 
-    def window(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Box to frame [m]: around some positions (…, dim), as far as the grid goes, with the walls that are near."""
+    def window(
+        self, positions: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Box to frame [m]: around some positions (…, dim), as far as the grid goes, with those of these walls that are near."""
         x = positions.reshape(-1, self.dim)
         x = x[np.isfinite(x).all(-1)]
         x = self.rest if len(x) == 0 else x
         low, high = x.min(0) - self.radii.max(), x.max(0) + self.radii.max()
         size = float((high - low).max())
-        for normal, offset in zip(self.normals, self.offsets, strict=True):
+        for normal, offset in zip(normals, offsets, strict=True):
             gap = float((x @ normal).min()) - offset
             if gap < size:
                 reach = max(gap, 0.0) + SHOWN_DEPTH * size

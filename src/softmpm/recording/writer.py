@@ -17,12 +17,15 @@ import torch
 from torch import Tensor
 
 from softmpm.checks import check_whole
+from softmpm.inputs import Inputs
 from softmpm.model import Model
 from softmpm.recording.digest import Content, Hash
 from softmpm.recording.file import begin, need_name, open_to_append, put_in_place, room
 from softmpm.recording.format import EPISODE, FRAME, PARTS, PER_FRAME, SCALAR, put, static_values, tables
 from softmpm.recording.format_checks import check_values
+from softmpm.recording.frame_values import as_numpy, of_one_world, strain
 from softmpm.state import ContactForces, GridField, State
+from softmpm.wall_poses import given_poses
 
 PER_FRAME_TABLES = {f"frame/{name}" for name in PER_FRAME}
 """Tables of which a frame has the row of its own number."""
@@ -41,7 +44,7 @@ class Recorder:
             recorder.scalars(0, {"loss": 0.3})
 
     A frame of n particles is 20 n bytes in 2D and 28 n in 3D, less what compression saves; a grid velocity comes on top, and forces of
-    w walls on s surface points with 8 (w + 1) s bytes in 2D and 12 (w + 1) s in 3D.
+    w walls on s surface points with 8 (w + 1) s bytes in 2D and 12 (w + 1) s in 3D, and a few bytes for each wall that moves.
 
     Args:
         path: The file to write. It must not exist, unless ``resume_before`` is given.
@@ -77,7 +80,7 @@ class Recorder:
                 check_whole(name, most, least)
         if resume_before is not None:
             check_whole("resume_before", resume_before, 0)
-        self.path, self.every = Path(path), every
+        self.path, self.every, self._model = Path(path), every, model
         if resume_before is None and self.path.exists():
             raise FileExistsError(
                 f"{self.path} exists; choose another path, or go on with resume_before=<iteration>."
@@ -185,7 +188,7 @@ class Recorder:
         points = self._points.to(forces.total.device)
         total, traction, places = (tensor.detach()[world] for tensor in forces)
         found = {"force": total, "traction": traction[:, points], "places": places[points]}
-        return {name: _numpy(tensor) for name, tensor in found.items() if tensor.numel()}
+        return {name: as_numpy(tensor) for name, tensor in found.items() if tensor.numel()}
 
     def _write(self, name: str, rows: np.ndarray) -> None:
         self._need_open()
@@ -232,6 +235,7 @@ class Episode:
         latent: Tensor | None = None,
         forces: ContactForces | None = None,
         *,
+        inputs: Inputs | None = None,
         world: int = 0,
     ) -> None:
         """Record one instant of one world. Nothing is differentiated or modified.
@@ -243,6 +247,8 @@ class Episode:
             field: Grid velocity [m/s], shape (world, *nodes, dim) or (*nodes, dim), or what ``rasterize`` returns.
             latent: What an observer saw, shape (world, size) or (size,).
             forces: What :func:`softmpm.contact_forces` returns for this state.
+            inputs: Of the call that led to ``state``, of which the last pose of the walls is recorded; None leaves the walls where the
+                scene has them.
             world: The world to record.
         """
         recorder, self._calls = self._recorder, self._calls + 1
@@ -257,20 +263,25 @@ class Episode:
             )
         particles = recorder._particles.to(state.x.device)
         x, v, F = (tensor.detach()[world][particles] for tensor in (state.x, state.v, state.F))
-        values = {"x": _numpy(x), "v": _numpy(v), "strain": _numpy(strain(F))}
+        values = {"x": as_numpy(x), "v": as_numpy(v), "strain": as_numpy(strain(F))}
         row = {name: table.shape[1:] for name, table in recorder._tables.items()}
         values["activation"] = np.full(row["frame/activation"], np.nan, np.float32)
         if activation is not None:
-            values["activation"] = _one_world("activation", activation, state, world, row["frame/activation"])
+            values["activation"] = of_one_world(
+                "activation", activation, state, world, row["frame/activation"]
+            )
         parts = {}
         if field is not None:
             velocity = field.velocity if isinstance(field, GridField) else field
-            parts["field"] = _one_world("field", velocity, state, world, row["field/velocity"])
+            parts["field"] = of_one_world("field", velocity, state, world, row["field/velocity"])
         if latent is not None:  # the first one decides the size
             size = row["latent/value"] if row["latent/value"] != (0,) else tuple(latent.shape[-1:])
-            parts["latent"] = _one_world("latent", latent, state, world, size)
+            parts["latent"] = of_one_world("latent", latent, state, world, size)
         if forces is not None:
             parts |= recorder._contact(forces, world)
+        if (poses := given_poses(recorder._model, inputs)) is not None:
+            last = (values[-1, world] for values in poses)
+            parts |= {name: as_numpy(value) for name, value in zip(("normals", "offsets"), last, strict=True)}
         frame = _Waiting(self, float(time), values, parts)
         if recorder._waiting is None:
             recorder._write_together([frame])
@@ -284,27 +295,7 @@ class Episode:
         pass
 
 
-def strain(F: Tensor) -> Tensor:
-    """Size of the Green strain, ‖(FᵀF − I)/2‖ [-], zero for every rigid motion; F is (..., dim, dim)."""
-    eye = torch.eye(F.shape[-1], dtype=F.dtype, device=F.device)
-    return torch.linalg.matrix_norm(F.mT @ F - eye) / 2
-
-
 def _checked(iteration: int) -> int:
     if not (iteration == int(iteration) and iteration >= 0):
         raise ValueError(f"iteration must be a whole number from 0 on, got {iteration}.")
     return int(iteration)
-
-
-def _numpy(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().to("cpu", torch.float32).numpy()
-
-
-def _one_world(name: str, tensor: Tensor, state: State, world: int, shape: tuple[int, ...]) -> np.ndarray:
-    every = (len(state.x), *shape)
-    if tuple(tensor.shape) not in (shape, every):
-        raise ValueError(
-            f"{name} must have shape {shape}, or {every} with a first axis world, got {tuple(tensor.shape)}; a frame is one instant, "
-            "so of many control steps it takes one."
-        )
-    return _numpy(tensor[world] if tensor.ndim > len(shape) else tensor)

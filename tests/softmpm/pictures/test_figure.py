@@ -347,7 +347,7 @@ def test_strokes_are_whole_and_on_the_faces_in_view(height):
         later = np.setdiff1d(np.arange(k + 1, len(places)), strokes)
         assert (np.linalg.norm(places[later] - places[k], axis=1) > radii[later]).all()
     place = of_scene(scene)
-    camera = Camera(*place.window(place.rest), place.up)
+    camera = Camera(*place.window(place.rest, place.normals, place.offsets), place.up)
     bottom = place.rest[:, 1] < 0.2 + 0.02
     inner = (np.abs(place.rest[:, [0, 2]] - (0.4, 0.35)) < (0.15, 0.1)).all(1)
     assert not camera.sees(place, place.rest)[bottom & inner].any()

@@ -35,7 +35,7 @@ def test_forces_are_read_as_they_were_recorded(tmp_path, dim):
     with softmpm.Recorder(path, model, resume_before=1, resume_digest=digest) as recorder:
         record_forces(recorder, model, 2)
     with softmpm.Recording(path) as recording:
-        assert recording.episodes == (0, 2) and recording.version == 3
+        assert recording.episodes == (0, 2) and recording.version == 4
         for iteration in recording.episodes:
             check(recording.frames(iteration), model, iteration, np.arange(surface.count))
         assert list(recording.static["surface_wall"]) == [0, 1]  # the third one slips
@@ -155,7 +155,7 @@ def test_files_of_version_1_are_read_drawn_and_resumed(tmp_path):
     with softmpm.Recorder(path, model, resume_before=5) as recorder:
         record_forces(recorder, model, 6)
     with softmpm.Recording(path) as recording:
-        assert recording.version == 3 and recording.episodes == (4, 6)
+        assert recording.version == 4 and recording.episodes == (4, 6)
         old = recording.frames(4)
         assert np.array_equal(old["x"], frames["x"]) and "force" not in old
         check(recording.frames(6), model, 6, np.arange(model.surface.count))

@@ -25,8 +25,9 @@ from helpers import busy_scene
 import softmpm
 from softmpm.recording import file as recording_file
 from softmpm.recording import reader
+from softmpm.recording.format import FRAMES
+from softmpm.recording.frame_values import strain
 from softmpm.recording.superblock import readable
-from softmpm.recording.writer import strain
 
 COUNT, NODES = 400, (16, 16)
 
@@ -298,11 +299,17 @@ def test_resume_keeps_what_came_before(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.h5", "whole.h5"]
 
 
-def without_names(path) -> None:
-    """Make a recording one of version 2."""
+def older(path, version: int) -> None:
+    """Make a recording without poses of walls one of version 3, or of 2 without names of muscles."""
     with h5py.File(path, "r+") as file:
-        del file["static/muscle_name"]
-        file.attrs["version"] = 2
+        index = file["frame/index"]
+        names, fill = FRAMES[version].names or (), np.full((), -1, FRAMES[version])
+        rows = np.array([tuple(row[name] for name in names) for row in index[()]], FRAMES[version])
+        del file["frame/index"], file["wall"]
+        file.create_dataset("frame/index", data=rows, maxshape=(None,), chunks=(1,), fillvalue=fill)
+        if version == 2:
+            del file["static/muscle_name"]
+        file.attrs["version"] = version
 
 
 def test_names_of_muscles_are_recorded(tmp_path):
@@ -312,7 +319,7 @@ def test_names_of_muscles_are_recorded(tmp_path):
         record(recorder, model, 0)
     with softmpm.Recording(path) as recording:
         assert recording.muscle_names == model.scene.muscle_names == ("Vorderbein № 1", 64 * "脚")
-    without_names(path)
+    older(path, 2)
     with softmpm.Recording(path) as recording:
         assert recording.version == 2 and recording.muscle_names == ("muscle 0", "muscle 1")
         assert check(recording, model, 0) == 4
@@ -327,11 +334,11 @@ def test_other_names_do_not_hinder_resuming(tmp_path, before):
         record(recorder, old, 0)
         digest = recorder.digest
     if before is None:
-        without_names(path)
+        older(path, 2)
     with softmpm.Recorder(path, model, resume_before=1, resume_digest=digest) as recorder:
         record(recorder, model, 1)
     with softmpm.Recording(path) as recording:
-        assert recording.muscle_names == ("left", "right") and recording.version == 3
+        assert recording.muscle_names == ("left", "right") and recording.version == 4
         assert [check(recording, model, iteration) for iteration in (0, 1)] == [4, 4]
 
 
