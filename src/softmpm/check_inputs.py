@@ -11,7 +11,7 @@ from torch import Tensor
 
 from softmpm.checks import ModelLike, check_tensor, demand, fields
 from softmpm.inputs import QUANTITIES, Inputs
-from softmpm.scene.check_scene import SAME
+from softmpm.scene.check_scene import SAME, least_damping
 from softmpm.validate import need
 
 
@@ -104,6 +104,14 @@ def check_inputs_bounds(model: ModelLike, given: dict[str, Tensor]) -> None:
     for name in {"wall_normal", "direction"} & given.keys():
         length = given[name].norm(dim=-1)
         demand(f"the length of inputs.{name}", length, length > 0, "> 0")
+    if (damping := given.get("damping")) is not None:
+        least = least_damping(model.scene.dt, model.dtype)
+        rule = f"0 or at least {least:.3g} 1/s, for less is lost in the rounding of {model.dtype}"
+        demand("inputs.damping", damping, (damping == 0) | (damping >= least), rule)
+    if (normal := given.get("wall_normal")) is not None and steps_of("wall_normal", normal):
+        onward = (normal[1:] * normal[:-1]).sum(dim=-1)
+        rule = "> 0: a wall turns by less than 90° in a control step; give the poses between"
+        demand("the product of each two successive inputs.wall_normal", onward, onward > 0, rule)
     for k in model.spec.mirrors:
         _check_stays(model, given, k)
 

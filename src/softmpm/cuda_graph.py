@@ -88,7 +88,7 @@ class Graph(Generic[Result]):
         # The stream is entered here as well: PyTorch does not leave it when a capture fails.
         with exclusive_capture(wait=True), torch.cuda.stream(stream), collected_resources() as resources:
             torch.cuda.synchronize(self.device)
-            with torch.cuda.graph(graph, stream=stream):
+            with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self._result = self.work()
                 words = [status.words for status in resources.statuses]
                 self._any_failed = (torch.cat(words) != NEVER).any() if words else None

@@ -180,7 +180,7 @@ def rollout_adj(
                 reports.append((Report(words), run.chunk.first + run.chunk.length - 1))
             del run  # release its buffers before the previous chunk is recomputed
     for report, last in reports:
-        raise_gradient_failure(model, report.read(), adj_end, last, horizon.total)
+        raise_gradient_failure(model, report.read(), last, adj_end, horizon.total)
     adj = runner.scheme.to_user(adj)
     if failed is not None:  # a state off the grid has no adjoint
         adj = _contiguous(adj, failed)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from softmpm.alarms import Failures
-from softmpm.errors import FROZEN, NEVER, UnstableError, at, place
+from softmpm.errors import FROZEN, NEVER, UnstableError, at, decode, place
+from softmpm.inputs import present
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
 from softmpm.schemes.alarm_check import armed
@@ -36,8 +37,11 @@ class Runner:
 
     def __init__(self, model: Model, values: Values, failures: Failures | None = None):
         self.model, self.failures = model, failures
-        # A captured graph keeps what it needs to name a failure; with it would live the history of these tensors.
-        self.values: Values = {name: tensor.detach() for name, tensor in values.items()}
+        # A captured graph keeps what it needs to name a failure; with it would live the history of these tensors. The others stay the
+        # same objects, by which a scheme knows a material that it has sorted already.
+        self.values: Values = {
+            name: tensor.detach() if tensor.requires_grad else tensor for name, tensor in values.items()
+        }
         self.frozen: dict[int, int] = {}
         self.failed: Tensor | None = None
         self._end: Any = None
@@ -58,7 +62,7 @@ class Runner:
             return None
         words = self.scheme.check_start(start, self.values)
         if is_capturing(self.model):
-            self._defer(words.clone(), None, 0, before=True)
+            self._defer(words.clone(), None, Chunk(0, 1, 1), self.values, before=True)
             return None
         return Report(words)
 
@@ -143,13 +147,15 @@ class Runner:
             run = self.run(chunk, start, keep)
             if is_capturing(self.model):
                 words = run.words[: self.model.worlds].clone()  # the backward pass overwrites them
-                self._defer(words, run.outgrow, chunk.first, values=in_rows(self.values, chunk.rows))
+                self._defer(words, run.outgrow, chunk, in_rows(self.values, chunk.rows))
                 return run
             if self.settled(run, Report(run.words)):
                 return run
             del run  # release its buffers before those with a larger window are allocated
 
-    def _defer(self, words: Tensor, outgrow: Callable[[], None] | None, first: int, **about: Any) -> None:
+    def _defer(
+        self, words: Tensor, outgrow: Callable[[], None] | None, chunk: Chunk, values: Values, **about: Any
+    ) -> None:
         """Check these words after each replay of the graph that is being captured; collect failures if the call does."""
         returned = self.failures is not None and self.failures.policy == "freeze"
         if self.failed is not None and not returned:  # such a world needs no window
@@ -159,18 +165,36 @@ class Runner:
             return
         failed = words < FROZEN
         self.failed = failed if self.failed is None else self.failed | failed
-        about |= {"first": first, "values": stiffest(self.model, about.get("values", self.values))}
-        defer_status_check(words, outgrow, functools.partial(self._collect, about, place()))
+        poses = {
+            one.name: values[one.name]
+            for one in present(self.model.spec)
+            if one.group == "wall" and one.name in values
+        }
+        about |= {"first": chunk.first, "values": stiffest(self.model, values)}
+        defer_status_check(words, outgrow, functools.partial(self._collect, about, poses, chunk, place()))
 
-    def _collect(self, about: dict[str, Any], notes: str, words: list[int]) -> None:
-        """Collect the first failure of each world in the last replay."""
+    def _collect(
+        self, about: dict[str, Any], poses: Values, chunk: Chunk, notes: str, words: list[int]
+    ) -> None:
+        """Collect the first failure of each world in the last replay.
+
+        Args:
+            about: Arguments of :func:`failure`.
+            poses: Of the walls, and their rates, in the control steps of the chunk.
+        """
         assert self.failures is not None
         new = [world for world in failed_worlds(words) if world not in self.failures.worlds]
         if not new:
             return
         end = self.scheme.particles(self._end)
         with at(notes):
-            self.failures.errors += [failure(self.model, words, world, end, **about) for world in new]
+            for world in new:
+                s = decode(words[world])[0]
+                row, time = chunk.row(s), ((chunk.first + s) % chunk.substeps + 1) * self.model.scene.dt
+                values = about["values"] | in_rows(poses, slice(row, row + 1))
+                self.failures.errors.append(
+                    failure(self.model, words, world, end, **about | {"values": values}, time=time)
+                )
 
     def captured(self, end: Any) -> Any:
         """The final state of a captured call that collects failures, as :class:`Failures` has it."""

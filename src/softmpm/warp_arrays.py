@@ -11,6 +11,7 @@ from softmpm.check_inputs import check_inputs, check_inputs_bounds, control_step
 from softmpm.check_state import check_finite, check_state
 from softmpm.checks import check_params, check_row
 from softmpm.compiling import opaque
+from softmpm.errors import MAX_SUBSTEP, NEVER
 from softmpm.inputs import INPUTS, Input, Inputs, differentiable, stored
 from softmpm.kernel_inputs import derive
 from softmpm.kernels.structs import element_type
@@ -19,7 +20,7 @@ from softmpm.planning.chunks import Horizon
 from softmpm.schemes.alarm_check import armed, check_end
 from softmpm.schemes.capture import is_capturing
 from softmpm.schemes.device import on_its_gpu, stream_of
-from softmpm.schemes.failure_report import raise_failure
+from softmpm.schemes.failure_report import raise_failure, raise_gradient_failure
 from softmpm.schemes.inputs import Values, grid_struct, particle_struct, shape_of
 from softmpm.schemes.lagrangian.nodal import particles_of, start_of
 from softmpm.schemes.lagrangian.nodal_step import NodalStep
@@ -96,13 +97,16 @@ class WarpSolid:
             )
 
     def raise_failure(self, model: Model, state: WarpState | WarpNodal) -> None:
-        """Raise :class:`softmpm.UnstableError` if a step so far failed. Waits for the device.
+        """Raise :class:`softmpm.UnstableError` if a step so far failed, or an adjoint since the last such error. Waits for the device.
 
         Checks ``state``, which the last step gave, for torn bodies and the running step limit as well.
         """
         check_own(model, "raise_failure", solid=self, state=state)
         self.work.stream = stream_of(model.device)
         _raise_failure(model, state, self.work, self.values())
+        adj_words = self.work.adj_words.tolist()
+        self.work.adj_words.fill_(NEVER)
+        raise_gradient_failure(model, adj_words, MAX_SUBSTEP)
 
 
 def _fingerprint(model: Model, tensor: Tensor) -> Tensor:

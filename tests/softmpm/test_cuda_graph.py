@@ -7,6 +7,7 @@ import threading
 import pytest
 import torch
 from helpers import KINDS, assert_relative, bar, busy_inputs, busy_scene, pretend_capture, run
+from surface_scenes import slab
 
 import softmpm
 from softmpm.errors import NEVER
@@ -94,6 +95,29 @@ def test_a_function_without_a_simulation_is_captured_too():
     for value in (1.0, 5.0, 7.0):
         x.fill_(value)
         assert graph().tolist() == [2 * value] * 3
+
+
+@pytest.mark.gpu
+def test_another_thread_may_allocate_during_a_capture():
+    """Memory of the GPU and pinned memory, as a simulation in that thread does."""
+    failed, x = [], torch.ones(3, device="cuda")
+
+    def allocate() -> None:
+        try:
+            torch.empty(2**28, device="cuda")
+            torch.empty(2**20, pin_memory=True)
+        except Exception as error:
+            failed.append(error)
+
+    def work() -> torch.Tensor:
+        if torch.cuda.is_current_stream_capturing():
+            other = threading.Thread(target=allocate)
+            other.start()
+            other.join()
+        return x * 2
+
+    graph = softmpm.Graph(work, x.device)
+    assert [graph().tolist() for _ in range(3)] == [[2.0] * 3] * 3 and not failed
 
 
 FORMULATIONS = {"moving": {}, "reference": dict(formulation="reference")}
@@ -232,6 +256,35 @@ def test_a_recording_differentiates_the_worlds_that_did_not_fail(settings, budge
     assert resources.collect()
     assert_gradient(got, want)
     assert_one_failure(recorded, kind)
+
+
+def test_a_recording_names_the_depth_in_the_wall_as_a_call_does(monkeypatch):
+    """The wall has moved since the chunk began: three control steps at rest, then 12 cells in one."""
+    model = softmpm.build(
+        slab(),
+        device="cpu",
+        formulation="moving",
+        inputs=("wall_offset",),
+        alarms=softmpm.Alarms(collapse=None, step=None, gap=None, overlap=None),
+    )
+    offset = torch.full((5, 1, 1), model.scene.walls[0].offset, dtype=torch.float64)
+    offset[-1] += 12 * model.scene.grid.spacing
+    called, recorded = softmpm.Failures("freeze"), softmpm.Failures("freeze")
+
+    def go(failures: softmpm.Failures) -> None:
+        inputs = softmpm.Inputs(wall_offset=offset)
+        with torch.no_grad():
+            softmpm.simulate(
+                model, model.rest(), None, model.params(), substeps=20, inputs=inputs, failures=failures
+            )
+
+    go(called)
+    pretend_capture(monkeypatch)
+    with capture.collected_resources() as resources:
+        go(recorded)
+    assert not resources.widen() and resources.collect()
+    (want,), (got,) = called.errors, recorded.errors
+    assert (got.kind, got.substep, got.value) == ("in_wall", want.substep, want.value)
 
 
 def torn_in_flight():

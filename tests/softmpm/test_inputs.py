@@ -286,6 +286,27 @@ def test_inputs_that_a_model_cannot_take():
         build(busy_scene(2, walls=()), inputs=("friction",))
 
 
+def test_what_rounding_or_interpolation_loses_is_refused():
+    """A damping that changes the velocity by less than 16 of its last digits, and a wall that turns by 90° or more at once."""
+    model = build(full_scene(2, driven=()), inputs=("damping", "wall_normal"))
+    least = 16 * torch.finfo(torch.float32).eps / model.scene.dt
+    turn = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64)[:, None, None].expand(
+        -1, 1, model.wall_count, -1
+    )
+    for inputs, said in (
+        (
+            Inputs(damping=torch.tensor([0.9 * least])),
+            r"inputs\.damping must be 0 or at least .* lost in the rounding",
+        ),
+        (Inputs(wall_normal=turn), "must be > 0: a wall turns by less than 90° in a control step"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, inputs=inputs)
+    for damping in (0.0, 1.1 * least):
+        inputs = Inputs(damping=torch.tensor([damping]))
+        softmpm.simulate(model, model.rest(), None, model.params(), substeps=1, inputs=inputs)
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("names", [(*GIVEN, *WALL_INPUTS), ("friction", "gravity")], ids=["all", "two"])
 def test_a_graph_takes_inputs(names):

@@ -1,5 +1,7 @@
 """The same gradients through ``step`` on a ``wp.Tape`` as through ``simulate``."""
 
+import math
+
 import pytest
 import torch
 import warp as wp
@@ -57,6 +59,31 @@ def test_tape_gives_the_gradients_of_simulate(dim, dtype, limit, device):
 
     tape.zero()
     assert all((array.grad.numpy() == 0).all() for array in states[0].differentiable())
+
+
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+def test_a_gradient_that_is_not_finite_is_named_and_stops_nothing(formulation):
+    """World, particle and the substep that the backward pass met first; afterwards steps go on, and a finite gradient is none."""
+    model = softmpm.build(busy_scene(2), worlds=2, device="cpu", formulation=formulation)
+    solid = softmpm.warp_solid(model, requires_grad=True)
+    states = [softmpm.warp_state(model, requires_grad=True) for _ in range(4)]
+    for bad in (True, False):
+        tape = wp.Tape()
+        for s in range(2):
+            softmpm.step(model, states[s], states[s + 1], solid, substep=s, tape=tape)
+        tape.zero()
+        wp.to_torch(states[2].v.grad)[1] = math.nan if bad else 1.0
+        tape.backward()
+        if bad:
+            with pytest.raises(
+                softmpm.UnstableError, match=r"of world 1 .* not finite at substep 1; .*the loss"
+            ) as error:
+                solid.raise_failure(model, states[2])
+            assert (error.value.kind, error.value.world, error.value.substep) == ("gradient", 1, 1)
+        solid.raise_failure(model, states[2])
+    softmpm.step(model, states[2], states[3], solid, substep=2)
+    moved = (wp.to_torch(states[3].v) != wp.to_torch(states[2].v)).flatten(1).any(1)
+    assert moved.tolist() == [True, True]
 
 
 def lame(inputs):

@@ -44,6 +44,11 @@ def check_scene(scene: Scene) -> None:
     check_mirrors(scene)
 
 
+def least_damping(dt: float, dtype: torch.dtype) -> float:
+    """Damping [1/s] below which rounding of the velocity in each substep changes its rate by more than 3 %, or stops it."""
+    return 16 * torch.finfo(dtype).eps / dt
+
+
 def check_precision(scene: Scene, dtype: torch.dtype) -> None:
     """Raise ValueError if rounding to ``dtype`` takes a value of the scene out of its bounds.
 
@@ -64,6 +69,13 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
         )
 
     heaviest = max(b.material.density * float(np.max(b.particles.volume)) for b in scene.bodies)
+    least_rate = least_damping(scene.dt, dtype)
+    need(
+        scene.damping == 0 or scene.damping >= least_rate,
+        f"damping must be 0 or at least {least_rate:.3g} 1/s in {dtype} with dt={scene.dt:g} s, for less is lost in rounding, got "
+        f"{scene.damping:g} 1/s; use damping=0"
+        + (" or dtype=torch.float64." if dtype == torch.float32 else "."),
+    )
     within("dt", scene.dt, least, most)
     within("grid spacing", scene.grid.spacing, least, most)
     for b, body in enumerate(scene.bodies):

@@ -113,29 +113,35 @@ def raise_failure(model: Model, words: list[int], end: State, **about) -> None:
         raise failure(model, words, min(failed, key=lambda world: words[world]), end, **about)
 
 
-def raise_gradient_failure(model: Model, words: list[int], adj_end: State, last: int, total: int) -> None:
+def raise_gradient_failure(
+    model: Model, words: list[int], last: int, adj_end: State | None = None, total: int | None = None
+) -> None:
     """Raise the first failure that the adjoint kernels reported, if any.
 
     Args:
         words: Status words, one for each world.
-        adj_end: Adjoint of the final state of the call.
-        last: Substep of the call from which the kernels counted backward.
-        total: Substeps of the call.
+        last: Substep from which the kernels counted backward.
+        adj_end: Adjoint of the final state of the call; None if it is not at hand.
+        total: Substeps of the call; None if there is no call.
     """
     world = min(range(len(words)), key=lambda w: words[w])
     if words[world] == NEVER:
         return
     back, kind, particle = decode(words[world])
     substep, limit = last - back, "gradients must be finite"
-    given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end.differentiable())
-    cause = (
-        "It overflowed in the backward pass: shorten the horizon or scale the loss"
-        if given
-        else ("The gradient of the loss with respect to the end state came in like that: look at the loss")
+    where = f"at substep {substep}" + (
+        "" if total is None else f" of {total}, counted from the start of the call"
     )
+    overflowed = "It overflowed in the backward pass: shorten the horizon or scale the loss"
+    came_in = "The gradient of the loss with respect to the end state came in like that: look at the loss"
+    if adj_end is None:
+        cause = f"{came_in}. If it is finite: {overflowed}"
+    else:
+        given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end.differentiable())
+        cause = overflowed if given else came_in
     raise UnstableError(
-        f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite at substep "
-        f"{substep} of {total}, counted from the start of the call; {limit}. {cause}.",
+        f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite {where}; "
+        f"{limit}. {cause}.",
         kind=kind.name.lower(),
         world=world,
         particle=particle,

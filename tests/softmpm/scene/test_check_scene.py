@@ -261,6 +261,10 @@ def soft(**changes) -> Body:
             lambda: scene(soft(density=1e36), dt=1.0),
             "smallest or largest volume of body 0 per unit of mass [J/kg] of ",
         ),
+        (
+            lambda: scene(soft(), damping=1.0, dt=1e-6),
+            "damping must be 0 or at least 1.91 1/s in torch.float32 with dt=1e-06 s",
+        ),
     ],
 )
 def test_what_single_precision_takes_away(made, said):

@@ -4,7 +4,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from softmpm.errors import FROZEN, NEVER, SUBSTEP_SHIFT
+from softmpm.errors import FROZEN, MAX_SUBSTEP, NEVER, SUBSTEP_SHIFT
 from softmpm.kernels.lagrangian.cells import cells
 from softmpm.kernels.structs import RequestedGrads, types
 from softmpm.model import Model
@@ -30,6 +30,7 @@ class NodalStep:
 
     Attributes:
         words: Status words of all steps so far, see errors.py; shape (world,).
+        adj_words: Of all adjoints so far, in which substeps count backward from the last possible one; shape (world,).
         last: Number of the substep that was launched last.
     """
 
@@ -37,6 +38,7 @@ class NodalStep:
         self.model, self.last = model, 0
         self.stream = stream_of(model.device)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
+        self.adj_words = self.words.clone()
         self._graph: ChunkGraph | None = None
         self._adjoints: dict[RequestedGrads, ChunkGraphAdj] = {}
 
@@ -45,7 +47,7 @@ class NodalStep:
         """Copy the state after ``now`` into ``then``. Worlds that failed in an earlier step stay as they are."""
         self.last, failed = substep, self.words != NEVER
         graph = self._launch(now, values, failed)
-        self._take(graph.buffers.words, substep)
+        _take(self.words, graph.buffers.words, substep)
         for own, found in zip(then, graph.end(), strict=True):
             assert own is not None and found is not None
             own.copy_(found)
@@ -61,7 +63,7 @@ class NodalStep:
         adjoint = self._adjoints[wanted]
         adjoint.load(now, adj_then)
         adjoint.run(self.stream)
-        self._take(graph.buffers.words, substep)
+        _take(self.adj_words, graph.buffers.words, MAX_SUBSTEP - substep)
         return adjoint.unload(self.stream, ONE, adj_inputs), adj_inputs
 
     def checked(self, end: Nodal, values: Values) -> Tensor:
@@ -96,7 +98,8 @@ class NodalStep:
         self._graph.run(self.stream)
         return self._graph
 
-    def _take(self, words: Tensor, substep: int) -> None:
-        """Retain the failures of a step, in which substeps count from 0."""
-        found = torch.where(words < FROZEN, words + (substep << SUBSTEP_SHIFT), words)
-        torch.minimum(self.words, found.where(words < FROZEN, self.words), out=self.words)
+
+def _take(known: Tensor, words: Tensor, substep: int) -> None:
+    """Retain the failures of a step, in which substeps count from 0."""
+    found = torch.where(words < FROZEN, words + (substep << SUBSTEP_SHIFT), words)
+    torch.minimum(known, found.where(words < FROZEN, known), out=known)

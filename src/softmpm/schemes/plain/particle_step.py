@@ -3,10 +3,13 @@
 from typing import Any
 
 import torch
+import warp as wp
 
+from softmpm.errors import MAX_SUBSTEP
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.model import Model
 from softmpm.planning.chunks import Chunk
+from softmpm.schemes.buffers import view
 from softmpm.schemes.carried import SurfaceContact, contact_on_grid
 from softmpm.schemes.carried_adj import SurfaceContactAdj
 from softmpm.schemes.plain.substep import Substep
@@ -21,10 +24,14 @@ class ParticleStep(Substep):
 
     Attributes:
         contact: Contact at surface points, or None.
+        adj_words: Status words of all adjoints so far, in which substeps count backward from the last possible one; shape (world,).
+            Apart from ``words``, by which worlds stop: a gradient that is not finite stops none.
     """
 
     def __init__(self, model: Model):
         super().__init__(model)
+        self.adj_words = self.words.clone()
+        self.adj_words_array = view(self.adj_words, wp.int64)
         self.contact: SurfaceContact | None = None
         if model.surface is not None:
             self.contact = contact_on_grid(model, ONE, keep=False)
@@ -66,7 +73,7 @@ class ParticleStep(Substep):
             self._load(surface)
             self._back[wanted].load(adj_end)
             contact = self.contact, self._back[wanted], 0
-        self.adjoint(wanted, *particles, adj_inputs, substep, contact)
+        self.adjoint(wanted, *particles, adj_inputs, MAX_SUBSTEP - substep, contact)
         return None if contact is None else contact[1].start(ONE)
 
     def check_depth(self, end: Any) -> None:

@@ -45,7 +45,7 @@ class Substep:
         self.particles = (model.worlds, model.particle_count)
         self.nodes = (model.worlds, model.node_count)
         self.words = torch.full((model.worlds,), NEVER, dtype=torch.int64, device=model.device)
-        self.words_array = view(self.words, wp.int64)
+        self.words_array = self.adj_words_array = view(self.words, wp.int64)
         self._arrays = {}
         self.last = 0  # number of the substep that was launched last
 
@@ -193,7 +193,7 @@ class Substep:
 
     def p2g_adj(self, wanted: RequestedGrads, now, adj_now, adj_inputs, substep: int) -> None:
         parameters = (self.model.constants, self.particle_inputs, substep, now, self._array("adj_node"))
-        arguments = (*parameters, self.words_array, adj_inputs, adj_now)
+        arguments = (*parameters, self.adj_words_array, adj_inputs, adj_now)
         kernel = transfer_adj(self.model.spec, wanted, self.ordered).p2g_adj
         self.launch(kernel, self.particles, *arguments)
 

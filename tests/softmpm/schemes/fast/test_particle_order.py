@@ -18,6 +18,7 @@ from softmpm.schemes.fast import footprint, particle_order
 from softmpm.schemes.fast import scheme as fast_scheme
 from softmpm.schemes.fast.footprint import MANY_CALLS, SMALL, first_margin
 from softmpm.schemes.fast.particle_order import STALE_FEW, ParticleLayout
+from softmpm.schemes.sorted_inputs import Permutation
 
 DX = 1 / 16  # a power of two: shifting by whole cells is exact
 
@@ -55,6 +56,26 @@ def window(found: ParticleLayout) -> tuple[np.ndarray, np.ndarray]:
     """First node in memory and the first one beyond, (world, dim) each."""
     first = found.origin.cpu().numpy()
     return first, first + np.array(found.shape)
+
+
+def test_a_material_is_sorted_once(monkeypatch):
+    """Calls with the same parameters without a gradient permute nothing; a changed parameter is permuted again."""
+    model = robot(2, [(6, 6)], grid=(20, 18), device="cpu")
+    count, permute = [0], Permutation.__call__
+
+    def counted(self, *arguments) -> None:
+        count[0] += 1
+        permute(self, *arguments)
+
+    monkeypatch.setattr(Permutation, "__call__", counted)
+    params, state, found = model.params(), model.rest(), []
+    for k in range(4):
+        if k == 3:
+            params.young.mul_(1.5)
+        count[0] = 0
+        state = softmpm.simulate(model, state, None, params, substeps=3)
+        found.append(count[0] > 0)
+    assert found == [True, False, False, True]
 
 
 # -- order and window ---------------------------------------------------------------------------------------------
