@@ -90,7 +90,8 @@ class Table(Mapping[str, Entry]):
             before = self._entries[name].build
             if _origin(before) != _origin(entry.build):
                 raise ValueError(
-                    f"the {self.what} {name!r} is registered already, by {_words(before)}; choose another name."
+                    f"the {self.what} {name!r} is registered already, by {_words(before)}; choose another name, or give only one "
+                    "of two files of which one imports the other."
                 )
         self._check(name, entry)
         self._entries[name] = entry

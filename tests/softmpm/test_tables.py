@@ -12,6 +12,7 @@ from softmpm.oracle import step_limit, stress
 from softmpm.scene import file
 from softmpm.scene.actuators import Actuator
 from softmpm.scene.materials import Material
+from softmpm_learn.tasks import task
 
 KERNELS = Path(softmpm.__file__).parent / "kernels" / "physics"
 
@@ -32,9 +33,19 @@ def public(base: type) -> set[type]:
 def test_laws():
     """Oracle, energy, energy for the step limit, file of scenes, kernels and tests have the same laws."""
     laws = public(Material)
-    assert laws == set(LAWS.values()) == set(stress.LAWS) == set(energy_density.DENSITIES)
-    assert laws == set(step_limit.ENERGIES) and laws <= set(file.TYPES.values())
-    assert kernel_files("laws") == set(LAWS) == {snake(law.__name__) for law in laws}
+    names = {snake(law.__name__): law for law in laws}
+    tables = {
+        "LAWS of tests/helpers.py": set(LAWS.values()),
+        "LAWS of softmpm/oracle/stress.py": set(stress.LAWS),
+        "DENSITIES of softmpm/energy_density.py": set(energy_density.DENSITIES),
+        "ENERGIES of softmpm/oracle/step_limit.py": set(step_limit.ENERGIES),
+        "TYPES of softmpm/scene/file.py": laws & set(file.TYPES.values()),
+        "LAWS of softmpm_learn/tasks/task.py": set(task.LAWS.values()),
+        "files of softmpm/kernels/physics/laws": {names.get(name, name) for name in kernel_files("laws")},
+    }
+    for table, found in tables.items():
+        assert found == laws, f"the {table} lack or have too many: {found ^ laws}"
+    assert names == LAWS == task.LAWS
 
 
 def test_actuators():

@@ -104,7 +104,10 @@ LAWS = {
 
 def law_of(material: Material) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
     if type(material) not in LAWS:
-        raise TypeError(f"the oracle has no law {type(material).__name__}; add its stress to LAWS.")
+        known = ", ".join(law.__name__ for law in LAWS)
+        raise TypeError(
+            f"softmpm has no law {type(material).__name__}, only {known}; docs/extending.md says how a further one is added."
+        )
     return LAWS[type(material)]
 
 

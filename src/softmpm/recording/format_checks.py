@@ -94,8 +94,8 @@ def check_frames(path: Path, index: np.ndarray, tables: dict[str, h5py.Dataset])
             raise ValueError(f"{path}: frame/index names rows of {name} beyond the {count} that there are.")
         if (np.diff(index[name][index[name] >= 0]) <= 0).any():
             raise ValueError(f"{path}: frame/index names a row of {name} twice, or after a later one.")
-    for name in PER_FRAME:
-        if len(tables[f"frame/{name}"]) < len(index):
-            raise ValueError(f"{path}: frame/{name} has fewer rows than frame/index.")
+    for table in {f"frame/{name}" for name in PER_FRAME} & tables.keys():
+        if len(tables[table]) < len(index):
+            raise ValueError(f"{path}: {table} has fewer rows than frame/index.")
     if not np.isfinite(index["time"]).all():
         raise ValueError(f"{path}: the times in frame/index must be finite.")

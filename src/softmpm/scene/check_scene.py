@@ -73,8 +73,7 @@ def check_precision(scene: Scene, dtype: torch.dtype) -> None:
     need(
         scene.damping == 0 or scene.damping >= least_rate,
         f"damping must be 0 or at least {least_rate:.3g} 1/s in {dtype} with dt={scene.dt:g} s, for less is lost in rounding, got "
-        f"{scene.damping:g} 1/s; use damping=0"
-        + (" or dtype=torch.float64." if dtype == torch.float32 else "."),
+        f"{scene.damping:g} 1/s; use {'dtype=torch.float64 or ' * (dtype == torch.float32)}damping=0.",
     )
     within("dt", scene.dt, least, most)
     within("grid spacing", scene.grid.spacing, least, most)

@@ -45,8 +45,8 @@ def check_policy(
             return policy(z, times[:, None], goal)
         except Exception as error:
             error.add_note(
-                f"policy {name} was asked for {len(times)} control steps at once, with features of shape {tuple(z.shape)} and times of "
-                f"shape ({len(times)}, 1)."
+                f"This was the policy {name}, asked for {len(times)} control steps at once, with features of shape {tuple(z.shape)} "
+                f"and times of shape ({len(times)}, 1). A policy has no memory from step to step."
             )
             raise
 

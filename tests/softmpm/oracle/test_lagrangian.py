@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import helpers
 import numpy as np
 import pytest
 import torch
@@ -11,11 +12,11 @@ from oracle_scenes import DIMS, DX, difference, f64, full, masses, randn, rest, 
 from softmpm.inputs import Inputs
 from softmpm.oracle import lagrangian, moving, stress, transfer, walls
 from softmpm.scene.actuators import Muscle, Pressure
-from softmpm.scene.materials import BarrierCorotated, FixedCorotated, NeoHookean, StableNeoHookean
+from softmpm.scene.materials import FixedCorotated, NeoHookean, StableNeoHookean
 from softmpm.scene.scene import Body, Particles, Scene, Wall
 from softmpm.state import State
 
-LAWS = (NeoHookean, StableNeoHookean, FixedCorotated, BarrierCorotated)
+LAWS = tuple(helpers.LAWS.values())
 
 
 def nodal(scene: Scene, params) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -2,6 +2,7 @@
 
 import math
 
+import helpers
 import pytest
 import torch
 from oracle_scenes import DIMS, difference, f64, randn
@@ -9,13 +10,8 @@ from oracle_scenes import DIMS, difference, f64, randn
 from softmpm.oracle import stress
 from softmpm.scene.materials import StableNeoHookean
 
-LAWS = {
-    "neo_hookean": stress.neo_hookean,
-    "stable_neo_hookean": stress.stable_neo_hookean,
-    "fixed_corotated": stress.fixed_corotated,
-    "barrier_corotated": stress.barrier_corotated,
-}
-SURVIVES_INVERSION = ("stable_neo_hookean", "fixed_corotated")
+LAWS = {name: stress.LAWS[law] for name, law in helpers.LAWS.items()}
+SURVIVES_INVERSION = {name for name, law in helpers.LAWS.items() if law.survives_inversion}
 
 
 MU, LAM = f64(3.0), f64(5.0)

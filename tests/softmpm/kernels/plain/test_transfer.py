@@ -7,7 +7,13 @@ from helpers import assert_relative, busy_inputs, busy_scene
 
 import softmpm
 from softmpm.kernel_inputs import derive
-from softmpm.kernels.physics.slot_sum import COLLECTORS, collect_slots, collectors
+from softmpm.kernels.physics.slot_sum import (
+    COLLECTORS,
+    PARTS,
+    collect_slots,
+    collect_slots_in_order,
+    collectors,
+)
 from softmpm.kernels.structs import RequestedGrads
 from softmpm.oracle import moving, stress, transfer
 from softmpm.planning.chunks import Horizon
@@ -191,6 +197,26 @@ def test_collecting_from_many_particles(device):
     wp.launch(
         collect_slots(spec), collectors(muscle.shape), arrays, device=wp.device_from_torch(summed.device)
     )
+    assert_relative(summed.cpu() - 1, want, 1e-12)
+    assert (slot.cpu() == torch.where(muscle < 0, found, 0.0)).all()
+
+
+def test_collecting_in_one_order_from_many_particles(device):
+    """More than there are partial sums: the same sums as in any order."""
+    spec = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64).spec
+    random = torch.Generator().manual_seed(0)
+    muscle = torch.randint(-1, 3, (2, 2 * PARTS + 7, spec.muscle_slots), generator=random).int()
+    found = torch.randn(muscle.shape, generator=random, dtype=torch.float64)
+    want = torch.stack([((muscle == k) * found).sum((1, 2)) for k in range(3)], 1)
+    summed, slot = torch.ones(2, 3, dtype=torch.float64, device=device), found.to(device)
+    part = torch.empty(2, 3, PARTS, dtype=torch.float64, device=device)
+    kernels, arrays = collect_slots_in_order(spec), [muscle.to(device), slot, part]
+    for kernel, size, tensors in (
+        (kernels.parts, part.shape, arrays),
+        (kernels.total, summed.shape, [part, summed]),
+    ):
+        views = [wp.from_torch(tensor, requires_grad=False) for tensor in tensors]
+        wp.launch(kernel, tuple(size), views, device=wp.device_from_torch(summed.device))
     assert_relative(summed.cpu() - 1, want, 1e-12)
     assert (slot.cpu() == torch.where(muscle < 0, found, 0.0)).all()
 
