@@ -50,9 +50,10 @@ def _contact_forces(model: Model, state: State) -> ContactForces:
 def clamp_forces(model: Model, state: State) -> Tensor:
     """Force of each clamp and plane of symmetry on the bodies in the control step that ended in ``state``.
 
-    The mean over a control step of T seconds, as with :func:`contact_forces`: T times the sum of the forces of all walls, gravity and
-    other loads is what the bodies gain in momentum. A plane of symmetry has the force of the half that is not simulated. Where planes
-    meet, the force on the nodes near the edge is divided equally among those that hold the component.
+    The mean over a control step of T seconds, as with :func:`contact_forces`: T times the sum of the forces of all walls, gravity
+    and other loads is what the bodies gain in momentum, without damping; a damping of γ takes e^(−γΔt) of each force. A plane of
+    symmetry has the force of the half that is not simulated. Where planes meet, the force on the nodes near the edge is divided
+    equally among those that hold the component.
 
     Args:
         model: From :func:`softmpm.build`, of a scene with walls of the kinds ``clamp`` or ``symmetry``.
