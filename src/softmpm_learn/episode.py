@@ -125,6 +125,7 @@ def run_episode(
                 observations.append(observation.detach())
             features = observer.encode(observation)
             activation = policy(features, times[step], goal)
+            _need_finite(activation, failures)
             if failures:
                 failed = torch.tensor(failures.worlds, device=activation.device)
                 activation = activation.index_fill(0, failed, 0.0)
@@ -155,6 +156,36 @@ def run_episode(
         activation=activations.detach(),
         decisions=made,
         path=path,
+    )
+
+
+def _need_finite(activation: Tensor, failures: softmpm.Failures | None) -> None:
+    """A policy whose activations are not finite has failed in these worlds, as a robot has that tears. In a captured graph, where
+    nothing can be read, the robot itself fails."""
+    if activation.is_cuda and torch.cuda.is_current_stream_capturing():
+        return
+    bad = (~activation.detach().isfinite()).any(dim=-1).nonzero()[:, 0].tolist()
+    errors = [
+        _not_finite(activation, world) for world in bad if failures is None or world not in failures.worlds
+    ]
+    if failures is not None:
+        failures.errors += errors
+    elif errors:
+        raise errors[0]
+
+
+def _not_finite(activation: Tensor, world: int) -> softmpm.UnstableError:
+    values, limit = activation.detach()[world].tolist(), "activations must be finite"
+    muscle = next(k for k, value in enumerate(values) if not math.isfinite(value))
+    return softmpm.UnstableError(
+        f"the policy gives an activation of {values[muscle]} for muscle {muscle} of world {world}; {limit}. Look at the policy, or "
+        "take smaller learning rates.",
+        kind="activation",
+        world=world,
+        particle=-1,
+        substep=0,
+        value=values[muscle],
+        limit=limit,
     )
 
 

@@ -128,6 +128,35 @@ def test_a_failure_names_the_control_step(task, model):
     assert "control step 0 of 6" in caught.value.__notes__[0]
 
 
+class NotAlways(nn.Module):
+    """The square root of what has become negative in one world, from the third control step on."""
+
+    def forward(self, z, time, goal=None):
+        value = torch.full((len(z), 2), 0.25)
+        value[1] -= 0.2 * float(time)
+        return (value - 0.2499).sqrt()
+
+
+def test_activations_that_are_not_finite_are_a_failure_of_their_world(task):
+    """Collected, with the control step, while the other world goes on as alone; else raised."""
+    model = softmpm.build(task.scene, device="cpu", worlds=2)
+    observer, failures = Centroids(model, [np.arange(4)], 1.0), softmpm.Failures("reset")
+    about = task, model, observer, NotAlways(), model.params()
+    episode = run_episode(*about, failures=failures)
+    (error,) = failures.errors
+    assert (error.kind, error.world, error.limit) == ("activation", 1, "activations must be finite")
+    assert "control step" in error.__notes__[0] and episode.end.x.isfinite().all()
+    alone = softmpm.build(task.scene, device="cpu")
+    want = run_episode(
+        task, alone, Centroids(alone, [np.arange(4)], 1.0), Constant([0.01, 0.01]), alone.params()
+    )
+    torch.testing.assert_close(episode.end.x[:1], want.end.x, rtol=1e-4, atol=1e-6)
+    with pytest.raises(
+        softmpm.UnstableError, match="the policy gives an activation of nan for muscle 0 of world 1"
+    ):
+        run_episode(*about)
+
+
 def test_a_failure_of_the_gradient_names_the_control_step(task, model):
     """That in which it overflows: of a loss of states two and five, whose own gradient does, the later one is met first."""
     observer = Centroids(model, [np.arange(4)], 1.0)

@@ -30,6 +30,16 @@ class _FreeList(list[CachedGraph]):
     """Free chunk graphs of one shape: a list that can be weakly referenced, see :func:`_return_to_cache`."""
 
 
+def _bytes(graphs: list[CachedGraph]) -> int:
+    """Bytes of the buffers of graphs and of the accumulators of their adjoints, which graphs may share; without their launches."""
+    found = {
+        id(one): one
+        for cached in graphs
+        for one in (adj.buffers.found for _, adj in cached.adjoints.values())
+    }
+    return sum(cached.graph.buffers.bytes for cached in graphs) + sum(one.bytes for one in found.values())
+
+
 def _return_to_cache(free: weakref.ref[_FreeList], cached: CachedGraph) -> None:
     """Return a leased graph to its cache, if that still exists; the lease itself does not keep the cache alive."""
     if (graphs := free()) is not None:
@@ -55,7 +65,7 @@ class GraphCache(ABC):
 
     @abstractmethod
     def new_graph(self, chunk: Chunk, keep: bool) -> Any:
-        """Graph of the chunks of one shape, with ``buffers.bytes``; ``keep`` says whether it stores its intermediate states."""
+        """Graph of the chunks of one shape, with ``buffers.bytes``; ``keep`` is True if it stores its intermediate states."""
 
     @abstractmethod
     def new_shared(self, graph: Any, wanted: RequestedGrads) -> Any:
@@ -63,7 +73,7 @@ class GraphCache(ABC):
 
     @abstractmethod
     def new_adjoint(self, graph: Any, shared: Any) -> Any:
-        """Adjoint of a graph on these buffers."""
+        """Adjoint of a graph on these buffers, with its accumulators in ``buffers.found``."""
 
     def take(self, chunk: Chunk, keep: bool) -> tuple[CachedGraph, _FreeList]:
         """Acquire a graph, and the list that it is returned to."""
@@ -92,7 +102,7 @@ class GraphCache(ABC):
         """Evict old shapes to make room for another graph."""
         shapes, part = self._free[keep], self.model.budget // self.model.calls
         for shape in list(shapes)[: -RETAINED_SHAPES[keep]]:
-            if sum(cached.graph.buffers.bytes for free in shapes.values() for cached in free) <= part:
+            if _bytes([cached for free in shapes.values() for cached in free]) <= part:
                 break
             del shapes[shape]
 

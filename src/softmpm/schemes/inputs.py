@@ -210,6 +210,11 @@ class Accumulators:
         walls = (model.wall_count,) if one.per == "wall" else ()
         return self._tensor(*rows, *walls, model.worlds * self.nodes, *vector)
 
+    @property
+    def bytes(self) -> int:
+        """Bytes of all accumulators."""
+        return sum(tensor.nbytes for tensor in self._cleared)
+
     def clear(self) -> None:
         """Set all accumulators to zero."""
         for tensor in self._cleared:

@@ -90,6 +90,12 @@ class SortedInputs:
                 dtype = torch.float64 if one.double else model.dtype
                 self.values[one.name] = tensor(*shape_of(model, one, self._rows), dtype=dtype)
 
+    @property
+    def bytes(self) -> int:
+        """Bytes of the buffers; what all chunks share is not among them."""
+        shared = {id(tensor) for tensor in self.model.fixed.values()}
+        return sum(tensor.nbytes for tensor in self.values.values() if id(tensor) not in shared)
+
     def take(self, stream: wp.Stream | None, chunk: Chunk, values: Values, moved: bool) -> None:
         """Copy the inputs of a call into the buffers; ``moved`` is True if the particle order has changed since the last copy."""
         model = self.model

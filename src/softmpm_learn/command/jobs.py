@@ -104,7 +104,7 @@ def run_jobs(jobs: Sequence[Job], group: Group, signals: Signals, failed: dict[i
         give_up(error)
     else:
         losses = [_record(one, own, group, failed) for one, own in zip(jobs, results, strict=True)]
-        if None in losses:
+        if None in losses or (signals.wished and group.size == 1):
             logger.info("The same command goes on with the sweep.")
             raise SystemExit(0)
         return [loss for loss in losses if loss is not None]

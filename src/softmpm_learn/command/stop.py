@@ -18,10 +18,12 @@ class Signals:
     Attributes:
         advice: What was saved and how to go on, said when a signal ends the process.
         quiet: Say nothing: another process does.
+        wished: A signal came while it was only a wish.
     """
 
     def __init__(self):
         self.advice, self.quiet = "No iteration had begun, so nothing is lost.", False
+        self.wished = False
         self._received: list[int] | None = None
         self._insist = True
 
@@ -47,6 +49,7 @@ class Signals:
     def _handle(self, number: int, frame: object) -> None:
         if self._received is not None and not (self._received and self._insist):
             self._received.append(number)
+            self.wished = True
             return
         if not self.quiet:
             os.write(2, f"softmpm_learn: interrupted. {self.advice}\n".encode())

@@ -41,12 +41,16 @@ def save(folder: Path, content: dict) -> Path:
 
     Args:
         content: Tensors, numbers, strings, lists and dicts: what ``torch.load(weights_only=True)`` reads.
+
+    Raises:
+        CheckpointError: It could not be read again; the older files are as they were.
     """
     buffer = io.BytesIO()
     torch.save({"format": FORMAT, **_compact(content)}, buffer)
     body = buffer.getvalue()
     body = body[:-2] + struct.pack("<H", _FOOTER)  # a zip archive ends with the length of its comment
     path = folder / NAME
+    _need_readable(body, path)
     draft = files.draft(path, body + _MARK + hashlib.sha256(body).hexdigest().encode())
     with files.named("write", path):
         if path.exists() and _intact(files.read(path)):
@@ -56,10 +60,23 @@ def save(folder: Path, content: dict) -> Path:
     return path
 
 
+def _need_readable(body: bytes, path: Path) -> None:
+    """Raise CheckpointError for what :func:`read` would refuse."""
+    try:
+        _check_content(torch.load(io.BytesIO(body), map_location="cpu", weights_only=True))
+    except Exception as error:
+        problem = str(error).split("WeightsUnpickler error:")[-1].strip().split("\n")[0]
+        raise CheckpointError(
+            f"no checkpoint was written to {path}, for it could not be read again: {problem}. Parts of a policy, an observer or "
+            "an optimizer must be finite tensors, numbers and texts; a buffer with persistent=False is not saved."
+        ) from error
+
+
 def _compact(value: Any) -> Any:
-    """The same without the rest of the memory of tensors that are parts of larger ones, which PyTorch would write as well."""
+    """The same with tensors that have their memory to themselves: of parts of larger ones PyTorch would write the rest as well, and one
+    that is expanded has less than its numbers."""
     if isinstance(value, Tensor):
-        return value.clone() if value.untyped_storage().nbytes() > value.nbytes else value
+        return value.clone() if value.untyped_storage().nbytes() != value.nbytes else value
     if isinstance(value, dict):
         return {key: _compact(item) for key, item in value.items()}
     return [_compact(item) for item in value] if isinstance(value, list) else value

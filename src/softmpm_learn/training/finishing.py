@@ -14,7 +14,7 @@ from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.training.evaluation import evaluate_best
-from softmpm_learn.training.examination import examine
+from softmpm_learn.training.examination import EXAMINED, examine
 from softmpm_learn.training.run_files import RunFiles, recorded
 
 logger = logging.getLogger("softmpm_learn")
@@ -91,6 +91,21 @@ def _end(run: Run) -> float | None:
     return run.end[1] if run.end and run.end[0] == run.iteration else None
 
 
+def _examined(runs: Runs, finer: Task | None) -> list[dict[str, float]]:
+    """The answers of :func:`examine`; none if something of the user's fails there, as a policy may that knows the times of an episode
+    alone. The runs are finished all the same."""
+    try:
+        return examine(runs, finer)
+    except Exception as error:
+        if runs.group.size > 1:  # the others wait
+            raise
+        logger.warning(
+            "The examination failed, so its columns stay empty (train.examine=false leaves it out): %s",
+            in_full(error),
+        )
+        return [dict.fromkeys(EXAMINED, math.nan) for _ in runs.all]
+
+
 @torch.no_grad()
 def finish(
     runs: Runs, files: Sequence[RunFiles], finer: Task | None, ends: dict[int, float]
@@ -107,7 +122,7 @@ def finish(
         if any(files[k].records for k in done):
             _record_best(runs, files, done)
         if ends:
-            answers = examine(runs, finer)
+            answers = _examined(runs, finer)
             found = {k: answers[k] | {"end": ends[k]} for k in done}
             for k in done:
                 run = runs.all[k]

@@ -128,7 +128,7 @@ def go_back(runs: Runs, k: int, error: Exception, retries: int) -> None:
         TrainingError: It was at rest.
     """
     run, most = runs.all[k], runs.all[k].settings.optimizer.retries
-    if run.safe and most and retries <= most and k in runs.active and run.best["iteration"] >= 0:
+    if run.safe and most and retries <= most and k in runs.active:
         if retries < most:
             logger.warning("%s: %s Going halfway back.", run.now, in_full(error))
             run.backtrack()

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import gc
 import math
+import signal
 import sys
 import types
 import weakref
@@ -18,6 +19,7 @@ from hydra.plugins.sweeper import Sweeper
 from softmpm_learn import train
 from softmpm_learn.command import app, experiment, jobs
 from softmpm_learn.command.jobs import Job, side_by_side
+from softmpm_learn.command.stop import Signals
 from softmpm_learn.config import RunConf
 from softmpm_learn.settings import ObserverConf, OptimizerConf, TrainConf
 from softmpm_learn.storage.sweep import Outcome
@@ -209,9 +211,28 @@ def test_processes_in_step_record_each_job(tmp_path, monkeypatch):
     failed, group = {}, types.SimpleNamespace(size=2, rank=0, first=True)
     monkeypatch.setattr(jobs, "experiments", lambda *_: [[None], [None]])
     monkeypatch.setattr(jobs, "outcome", lambda conf, out, *_: ended[int(out.name)])
-    assert jobs.run_jobs(some, group, None, failed) == [math.inf, 1.5]
+    assert jobs.run_jobs(some, group, Signals(), failed) == [math.inf, 1.5]
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [row["status"] for row in rows] == ["failed", "finished"] and failed == {0: table}
+
+
+def test_a_wish_to_stop_in_the_last_iteration_ends_the_sweep(tmp_path, monkeypatch):
+    """The job that was about to end is recorded, and no other begins."""
+    one, signals = Job(number=0, settings="", out=tmp_path / "0", table=tmp_path / "sweep.csv"), Signals()
+    one.out.mkdir()
+
+    def meanwhile(*_):
+        with signals.awaited():
+            signals._handle(signal.SIGTERM, None)
+        return [[None]]
+
+    monkeypatch.setattr(jobs, "experiments", meanwhile)
+    done = Outcome(job=0, status="finished", loss=1.5, settings="", folder="0")
+    monkeypatch.setattr(jobs, "outcome", lambda *_: done)
+    with pytest.raises(SystemExit):
+        jobs.run_jobs([one], types.SimpleNamespace(size=1, rank=0, first=True), signals, {})
+    (row,) = csv.DictReader(one.table.read_text().splitlines())
+    assert row["status"] == "finished"
 
 
 def test_processes_out_of_step_end_with_the_job(tmp_path, monkeypatch):
@@ -224,6 +245,6 @@ def test_processes_out_of_step_end_with_the_job(tmp_path, monkeypatch):
 
     monkeypatch.setattr(jobs, "experiments", fails)
     with pytest.raises(SystemExit):
-        jobs.run_jobs([one], types.SimpleNamespace(size=2, rank=0, first=True), None, {})
+        jobs.run_jobs([one], types.SimpleNamespace(size=2, rank=0, first=True), Signals(), {})
     (row,) = csv.DictReader(one.table.read_text().splitlines())
     assert (row["status"], row["error"]) == ("failed", "lost")

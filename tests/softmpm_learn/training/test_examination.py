@@ -17,7 +17,7 @@ from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
 from softmpm_learn.term import Path, Term
 from softmpm_learn.train import train
-from softmpm_learn.training import examination
+from softmpm_learn.training import examination, finishing
 from softmpm_learn.training.examination import examine, motion, rubbed
 
 
@@ -172,6 +172,26 @@ def test_a_replay_that_fails_names_its_control_step(run, task, caplog):
         assert examination.replayed(Runs([run]), task, [SimpleNamespace(activation=strong)]) == [None]
     [message] = caplog.messages
     assert message.startswith("Examination, finer:") and "In control step 1 of " in message
+
+
+def test_an_examination_that_fails_leaves_the_run_finished(
+    task, model, settings, tmp_path, monkeypatch, caplog
+):
+    """As with a policy that knows the times of an episode alone: its columns are empty, and the log says why."""
+
+    def fails(*_):
+        raise IndexError("index 4 is out of bounds")
+
+    monkeypatch.setattr(finishing, "examine", fails)
+    settings.observer.name, settings.train.examine = "centroids", True
+    with caplog.at_level("WARNING", logger="softmpm_learn"):
+        result = train(task, model, settings, tmp_path / "run")
+    assert (
+        result.finished
+        and math.isnan(result.examination["later"])
+        and math.isfinite(result.examination["end"])
+    )
+    assert "The examination failed" in caplog.text and "index 4 is out of bounds" in caplog.text
 
 
 def test_a_run_ends_with_its_examination(task, model, settings, tmp_path):

@@ -152,7 +152,7 @@ class ChunkBuffers:
         """Bytes of the buffers."""
         points = 0 if self.contact is None else self.contact.bytes
         tensors = (self.base, self.rows, self.nodes, self.velocity)
-        return points + self.sums.bytes + sum(tensor.nbytes for tensor in tensors)
+        return points + self.inputs.bytes + self.sums.bytes + sum(tensor.nbytes for tensor in tensors)
 
     def packed_at(self, s: int):
         """Packed state before substep ``s``."""

@@ -96,7 +96,8 @@ class ChunkBuffers:
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        return sum(one.nbytes for one in (self.u, self.v, self.w, self.anchor)) + chunk_bytes(self.model)
+        states, rows = (self.u, self.v, self.w, self.anchor), self.chunk.row(self.chunk.length - 1) + 1
+        return sum(one.nbytes for one in states) + chunk_bytes(self.model, rows)
 
     def index(self, s: int) -> int:
         """Number of the state before substep ``s``."""

@@ -53,12 +53,13 @@ class LagrangianFootprint:
         return Buffers(graphs + overlap, overlap + (0 if chosen.keep_all else graphs), backward)
 
 
-def chunk_bytes(model) -> int:
-    """Bytes of the buffers of a chunk besides its states: low, masses, sums, inputs and their order, forces, contact."""
+def chunk_bytes(model, control_steps: int = 1) -> int:
+    """Bytes of the buffers of a chunk of so many control steps besides its states: low, masses, sums, inputs and their order, forces,
+    contact."""
     order = 4 * model.worlds * model.particle_count
     nodes = 2 * _field_bytes(model) + _field_bytes(model) // model.dim + _sum_bytes(model)
     points = _anchor_bytes(model) + _contact_bytes(model)
-    return nodes + input_bytes(model, 1) + order + points
+    return nodes + input_bytes(model, control_steps) + order + points
 
 
 def _reaction_bytes(model) -> int:
