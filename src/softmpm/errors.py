@@ -75,7 +75,8 @@ class UnstableError(RuntimeError):
     Attributes:
         kind: One of ``start``, ``not_finite``, ``left_grid``, ``inverted`` (det F ≤ 0), ``collapsed`` (det F below its limit),
             ``torn`` (neighbours at rest too far apart), ``step`` (dt above the running stable step), ``in_wall`` (a surface point is
-            deep inside a wall), ``overlap`` (bodies, or parts of one, pass through each other), ``gradient``.
+            deep inside a wall), ``overlap`` (bodies, or parts of one, pass through each other), ``gradient``; and in the learner
+            ``activation``.
         world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite, for ``in_wall`` the one next to
             the surface point.
         substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.

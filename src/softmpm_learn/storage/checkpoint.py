@@ -46,11 +46,12 @@ def save(folder: Path, content: dict) -> Path:
         CheckpointError: It could not be read again; the older files are as they were.
     """
     buffer = io.BytesIO()
-    torch.save({"format": FORMAT, **_compact(content)}, buffer)
+    content = {"format": FORMAT, **_compact(content)}
+    torch.save(content, buffer)
     body = buffer.getvalue()
     body = body[:-2] + struct.pack("<H", _FOOTER)  # a zip archive ends with the length of its comment
     path = folder / NAME
-    _need_readable(body, path)
+    _need_readable(content, body, path)
     draft = files.draft(path, body + _MARK + hashlib.sha256(body).hexdigest().encode())
     with files.named("write", path):
         if path.exists() and _intact(files.read(path)):
@@ -60,10 +61,13 @@ def save(folder: Path, content: dict) -> Path:
     return path
 
 
-def _need_readable(body: bytes, path: Path) -> None:
-    """Raise CheckpointError for what :func:`read` would refuse."""
+def _need_readable(content: dict, body: bytes, path: Path) -> None:
+    """Raise CheckpointError for what :func:`read` would refuse. Types are checked by reading the first two files: the second has the
+    state of an optimizer that has taken a step."""
     try:
-        _check_content(torch.load(io.BytesIO(body), map_location="cpu", weights_only=True))
+        _check_content(content)
+        if not path.with_name(PREVIOUS).exists():
+            torch.load(io.BytesIO(body), map_location="cpu", weights_only=True)
     except Exception as error:
         problem = str(error).split("WeightsUnpickler error:")[-1].strip().split("\n")[0]
         raise CheckpointError(
