@@ -122,7 +122,8 @@ def job(
         if found:
             group.once(sweep.update, out, found)
         if found and found.status == "failed":
-            end(1, f"{found.error} The other seeds are finished; {plugins.resume(out)} tries again.")
+            others = "The other seeds are finished; " if any(result.finished for result in results) else ""
+            end(1, f"{found.error} {others}{plugins.resume(out)} tries again.")
         return seeds.median_loss(results)
     except JobError as failure:
         end(1, str(failure))

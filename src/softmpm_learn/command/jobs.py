@@ -164,13 +164,28 @@ def experiments(jobs: Sequence[tuple[RunConf, Path]], group: Group, signals: Sig
     with log_file() as begin_log:
         try:
             about = group, signals, lambda: begin_log(out / "softmpm_learn.log")
-            return [run_experiment(*jobs[0], *about)] if len(jobs) == 1 else run_side_by_side(jobs, *about)
+            found = [run_experiment(*jobs[0], *about)] if len(jobs) == 1 else run_side_by_side(jobs, *about)
+            for _, folder in jobs:
+                _traceback_of(folder, group).unlink(missing_ok=True)  # of an earlier attempt
+            return found
         except Exception as error:
             if isinstance(error, OtherProcessError) or (isinstance(error, TrainingError) and not group.first):
                 raise JobError from None
             kind = RefusedError if isinstance(error, LockedError) else JobError
-            done = error.iteration if isinstance(error, TrainingError) else 0
+            done = error.iteration if isinstance(error, TrainingError) else _iterations(out)
             raise kind(f"{sentence(error)}{_left(error, out, group)}", done) from error
+
+
+def _iterations(out: Path) -> int:
+    """Iterations of a run that its table has; 0 for seeds side by side, which have tables of their own."""
+    try:
+        return max(len((out / "metrics.csv").read_text().splitlines()) - 1, 0)
+    except OSError:
+        return 0
+
+
+def _traceback_of(out: Path, group: Group) -> Path:
+    return out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
 
 
 def _left(error: Exception, out: Path, group: Group) -> str:
@@ -178,7 +193,7 @@ def _left(error: Exception, out: Path, group: Group) -> str:
     the line of theirs that it came from."""
     line = _own_line(error)
     known = isinstance(error, EXPECTED) and not line
-    place = out / (f"error.{group.rank}.txt" if group.rank else "error.txt")
+    place = _traceback_of(out, group)
     if isinstance(error, LockedError) or is_lost(error):
         return ""
     try:

@@ -110,7 +110,11 @@ def _runs(folder: Path, job: int | None = None) -> Iterator[SweptRun]:
     need = {"job", "status", "settings", "folder"}
     if not rows or not need <= set(rows[0]):
         raise ValueError(f"{path} must have the columns {', '.join(sorted(need))} and a row for each job.")
-    for row in rows:
+    for line, row in enumerate(rows, 2):
+        if None in row or None in row.values():
+            raise ValueError(
+                f"{path}, line {line}, is damaged; the command of the sweep, given again, writes the table anew."
+            )
         number = int(row["job"]) if job is None else job
         place = _place(folder, Path(row["folder"]))
         if (place / sweep.TABLE).is_file() and place.resolve() != folder.resolve():

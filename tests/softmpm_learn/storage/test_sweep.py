@@ -74,6 +74,24 @@ def test_a_failed_job_is_a_row_and_the_next_one_runs(run, capsys):
     assert "Traceback" in (Path(failed["folder"]) / "error.txt").read_text()
 
 
+def test_a_failure_of_any_kind_says_how_many_iterations_were_done(run, monkeypatch):
+    """The traceback of the first attempt goes away with the second, which finishes."""
+    real, failed = optimisation.attempt, []
+
+    def fails(runs, *args):
+        if runs.all[0].iteration == 1 and not failed:
+            failed.append(True)
+            raise MemoryError("no room")
+        return real(runs, *args)
+
+    monkeypatch.setattr(optimisation, "attempt", fails)
+    for code, status, iterations in ((1, "failed", "1"), (0, "finished", "2")):
+        assert run("train.seed=0")[0] == code
+        (row,) = table()
+        assert (row["status"], row["iterations"]) == (status, iterations)
+        assert (Path(row["folder"]) / "error.txt").exists() == (status == "failed")
+
+
 def test_a_failed_job_says_how_many_iterations_it_has_done(run, monkeypatch):
     """Those in metrics.csv, before the one in which its simulation failed; tried again, it gives the same row."""
     real, words = optimisation.attempt, ("train.seed=0", "optimizer.retries=0")
@@ -96,6 +114,16 @@ def test_a_setting_that_no_run_accepts_is_a_row_too(run):
     assert run("task.seconds=-1,0.05")[0] == 1
     failed, finished = table()
     assert "task.seconds must be > 0" in failed["error"] and finished["status"] == "finished"
+
+
+def test_the_same_command_writes_a_damaged_table_anew(run):
+    """As the sentence on one says; nothing is run again."""
+    run("train.seed=0")
+    (path,) = Path("outputs/sweep").glob("*/sweep.csv")
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) // 2])
+    run("train.seed=0")
+    assert path.read_text() == whole
 
 
 def test_the_same_command_skips_what_has_finished(run, monkeypatch):
