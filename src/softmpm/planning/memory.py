@@ -252,7 +252,7 @@ def memory(model, horizon) -> Memory:
     adjoints = 2 * state + given + 3 * sizes.nodes + buffers.backward
     if model.spec.deterministic:
         adjoints += 2 * sizes.nodes
-    chunks = len(horizon.chunks(chosen.longest))
+    chunks, _ = horizon.counted(chosen.longest)
     runs = 1.0 if chosen.keep_all else 2 + recomputed(chunks, chosen.checkpoints) / chunks
     return Memory(
         buffers.forward + material + sizes.start, kept, kept + chosen.recomputed + state + adjoints, runs

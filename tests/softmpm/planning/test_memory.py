@@ -10,7 +10,7 @@ from helpers import busy_scene
 import softmpm
 from softmpm.planning.checkpointing import backward_schedule
 from softmpm.planning.chunks import Horizon
-from softmpm.planning.memory import Plan, Sizes, default_budget, plan, price_of_chunk
+from softmpm.planning.memory import Plan, Sizes, default_budget, memory, plan, price_of_chunk
 
 SIZES = Sizes(inside=100, nodes=10, between=104, start=130, longest=64, price=4, calls=1)
 
@@ -123,3 +123,16 @@ def test_the_longest_call_is_planned_at_once():
         before = Horizon.chunks.cache_info().currsize
         assert plan(horizon, SIZES, 10**6).checkpoints > 0
         assert Horizon.chunks.cache_info().currsize == before
+
+
+@pytest.mark.parametrize("formulation", ["moving", "reference"])
+@pytest.mark.parametrize("budget", [None, 10_000_000])
+def test_the_longest_call_is_described_at_once(formulation, budget, monkeypatch):
+    """Its chunks, of which there are a million, are counted and not built."""
+    model = softmpm.build(busy_scene(2), device="cpu", formulation=formulation, memory_budget=budget)
+
+    def built(*_):
+        raise AssertionError("chunks were built")
+
+    monkeypatch.setattr(Horizon, "chunks", built)
+    assert model.describe(10**8) and memory(model, Horizon(25, 10**6)).runs >= 1

@@ -92,25 +92,19 @@ class FastFootprint:
         if model.surface is not None:
             # The same again, velocities of a second substep, and what contact adds to the adjoints of the nodes.
             passed += second + 2 * sizes.nodes
+        chunks, lengths = horizon.counted(chosen.longest)
         if chosen.keep_all and copies(model):
             order = 4 * model.worlds * model.particle_count
-            states = max((chunk.length for chunk in horizon.chunks(chosen.longest)), default=0) * (
-                sizes.inside + sizes.nodes
-            )
-            kept = model.calls * order * len(horizon.chunks(chosen.longest))
+            states = max(lengths, default=0) * (sizes.inside + sizes.nodes)
+            kept = model.calls * order * chunks
             return Buffers(forward, kept + _at_once(horizon, chosen.longest) * (small + states), passed)
         if chosen.keep_all:
-            kept = model.calls * graph * len(horizon.chunks(chosen.longest))
+            kept = model.calls * graph * chunks
             return Buffers(forward, kept, passed)
-        kept = graph * _shapes(horizon, chosen.longest) + small * _at_once(horizon, chosen.longest)
+        kept = graph * len(lengths) + small * _at_once(horizon, chosen.longest)
         # PyTorch runs backward passes on a GPU in a thread of their own, whose recomputed chunks have separate buffers.
         recomputed = 2 * small if model.device.type == "cuda" else 0
         return Buffers(forward, kept, passed + recomputed)
-
-
-def _shapes(horizon, longest: int) -> int:
-    """Number of distinct chunk shapes."""
-    return len({chunk.shape for chunk in horizon.chunks(longest)})
 
 
 def _at_once(horizon, longest: int) -> int:
@@ -118,4 +112,5 @@ def _at_once(horizon, longest: int) -> int:
 
     One is running, one has been launched ahead, one contains the initial state of the first, and one of another shape may be cached.
     """
-    return min(len(horizon.chunks(longest)), 3 + (_shapes(horizon, longest) > 1))
+    chunks, lengths = horizon.counted(longest)
+    return min(chunks, 3 + (len(lengths) > 1))

@@ -42,9 +42,9 @@ class LagrangianFootprint:
         field, anchors, sums, contact = (
             part(model) for part in (_field_bytes, _anchor_bytes, _sum_bytes, _contact_bytes)
         )
-        chunks, overlap = horizon.chunks(chosen.longest), overlap_bytes(model)
+        (chunks, lengths), overlap = horizon.counted(chosen.longest), overlap_bytes(model)
         # One runs, one is launched ahead, and one of another shape may be cached.
-        at_once = min(len(chunks), 2 + (len({chunk.shape for chunk in chunks}) > 1))
+        at_once = min(chunks, 2 + (len(lengths) > 1))
         graphs = at_once * (4 * field + 2 * anchors + chunk_bytes(model))
         low = 0 if stores_u(model.spec) else field
         reflected = 0 if model.mirror is None else 2 * field
