@@ -190,8 +190,11 @@ class Runner:
         with at(notes):
             for world in new:
                 s = decode(words[world])[0]
-                row, time = chunk.row(s), ((chunk.first + s) % chunk.substeps + 1) * self.model.scene.dt
-                values = about["values"] | in_rows(poses, slice(row, row + 1))
+                row, done = chunk.row(s), 0 if about.get("before") else (chunk.first + s) % chunk.substeps + 1
+                values, time = (
+                    about["values"] | in_rows(poses, slice(row, row + 1)),
+                    done * self.model.scene.dt,
+                )
                 self.failures.errors.append(
                     failure(self.model, words, world, end, **about | {"values": values}, time=time)
                 )
