@@ -78,7 +78,7 @@ class UnstableError(RuntimeError):
             deep inside a wall), ``overlap`` (bodies, or parts of one, pass through each other), ``gradient``; and in the learner
             ``activation``.
         world, particle: Where. In a backward pass ``particle`` is the one whose adjoint is not finite, for ``in_wall`` the one next to
-            the surface point.
+            the surface point, and -1 for ``activation``.
         substep: Substep of the call, counted from 0; in a backward pass the one being differentiated.
         value: The offending value.
         limit: The limit that it violates.

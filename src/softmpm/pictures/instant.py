@@ -80,7 +80,7 @@ def of_state(
 
 def framed(place: Surroundings, instants: Sequence[Instant]) -> tuple[np.ndarray, np.ndarray]:
     """Box to frame [m]: around the particles of some instants, with the walls that are near, wherever these have been."""
-    walls = [(np.column_stack(walls_of(place, instant))) for instant in instants]
+    walls = [np.column_stack(walls_of(place, instant)) for instant in instants]
     each = np.unique(np.concatenate(walls), axis=0)
     return place.window(
         np.concatenate([instant.positions for instant in instants]), each[:, :-1], each[:, -1]

@@ -34,7 +34,12 @@ class Chunk:
     def rows(self) -> slice:
         """Control steps that the chunk touches."""
         first = self.first // self.substeps
-        return slice(first, first + self.row(self.length - 1) + 1)
+        return slice(first, first + self.row_count)
+
+    @property
+    def row_count(self) -> int:
+        """Number of these control steps."""
+        return self.row(self.length - 1) + 1
 
     def row(self, s: int) -> int:
         """Index, within :attr:`rows`, of the control step that contains substep ``s`` of the chunk."""

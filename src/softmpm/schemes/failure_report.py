@@ -132,13 +132,14 @@ def raise_gradient_failure(
     where = f"at substep {substep}" + (
         "" if total is None else f" of {total}, counted from the start of the call"
     )
-    overflowed = "It overflowed in the backward pass: shorten the horizon or scale the loss"
-    came_in = "The gradient of the loss with respect to the end state came in like that: look at the loss"
+    came_in = "the gradient of the loss with respect to the end state came in like that: look at the loss"
+    overflowed = "it overflowed in the backward pass: shorten the horizon or scale the loss"
     if adj_end is None:
-        cause = f"{came_in}. If it is finite: {overflowed}"
+        cause = f"Either {came_in}; or {overflowed}"
     else:
         given = all(bool(torch.isfinite(adj[world]).all()) for adj in adj_end.differentiable())
         cause = overflowed if given else came_in
+        cause = cause[0].upper() + cause[1:]
     raise UnstableError(
         f"particle {particle} (body {int(model.body[particle])}) of world {world} has an adjoint that is not finite {where}; "
         f"{limit}. {cause}.",

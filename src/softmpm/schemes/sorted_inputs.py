@@ -55,7 +55,7 @@ class SortedInputs:
 
     def __init__(self, model: Model, chunk: Chunk, order: Tensor):
         self.model, self.chunk = model, chunk
-        self._rows = chunk.row(chunk.length - 1) + 1
+        self._rows = chunk.row_count
         lead, found = (model.worlds, model.particle_count), stored(model.spec)
         self._scalars = [one.name for one in found if is_particle_scalar(one)]
         self._indices = [one.name for one in found if one.sorted and one.kind == "index"]

@@ -12,9 +12,10 @@ from softmpm_learn.distributed import in_full
 from softmpm_learn.episode import run_episode
 from softmpm_learn.runs.run import Run
 from softmpm_learn.runs.runs import Runs
+from softmpm_learn.storage.sweep import EXAMINED
 from softmpm_learn.tasks.task import Task
 from softmpm_learn.training.evaluation import evaluate_best
-from softmpm_learn.training.examination import EXAMINED, examine
+from softmpm_learn.training.examination import examine
 from softmpm_learn.training.run_files import RunFiles, recorded
 
 logger = logging.getLogger("softmpm_learn")

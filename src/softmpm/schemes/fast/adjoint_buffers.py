@@ -83,7 +83,7 @@ class ChunkAdjoint:
     def __init__(self, forward: ChunkBuffers, shared: SharedAdjoint):
         self.forward, self.shared, self.model = forward, shared, forward.model
         self.wanted, chunk = shared.wanted, forward.chunk
-        self.found = shared.accumulators(chunk.row(chunk.length - 1) + 1)
+        self.found = shared.accumulators(chunk.row_count)
         self._unsort = unsort(self.model, forward.order, self.found)
         model, t, order = self.model, forward.types, forward.order_array
         pack, sort = packing(t.dim, model.spec.dtype), sorting(t.dim, model.spec.dtype)

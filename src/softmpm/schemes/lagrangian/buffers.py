@@ -96,8 +96,8 @@ class ChunkBuffers:
     @property
     def bytes(self) -> int:
         """Bytes of the buffers."""
-        states, rows = (self.u, self.v, self.w, self.anchor), self.chunk.row(self.chunk.length - 1) + 1
-        return sum(one.nbytes for one in states) + chunk_bytes(self.model, rows)
+        states = sum(one.nbytes for one in (self.u, self.v, self.w, self.anchor))
+        return states + chunk_bytes(self.model, self.chunk.row_count)
 
     def index(self, s: int) -> int:
         """Number of the state before substep ``s``."""
@@ -213,7 +213,7 @@ class ChunkAdjoint:
     def __init__(self, forward: ChunkBuffers, shared: SharedAdjoint):
         self.forward, self.shared, self.model = forward, shared, forward.model
         chunk = forward.chunk
-        self.found = shared.accumulators(chunk.row(chunk.length - 1) + 1)
+        self.found = shared.accumulators(chunk.row_count)
         self._unsort = unsort(self.model, forward.order, self.found)
         self.adj_placed_mass = None
         if "mass" in self.found.tensors:

@@ -83,7 +83,7 @@ class PlainRun:
         """Adjoint of the start; adds those of the inputs into ``adj_inputs``."""
         model, chunk, step = self.model, self.chunk, self.step
         step.words.fill_(NEVER)
-        rows = chunk.row(chunk.length - 1) + 1
+        rows = chunk.row_count
         found = Accumulators(model, wanted, rows, model.node_count)
         adjoints = MotionAdj.zeros(model), MotionAdj.zeros(model)
         structs = [adj.struct(model) for adj in adjoints]

@@ -185,38 +185,24 @@ def test_p2g_adj(bench):
     assert (found.tensors["active_stress"] == 0).all(), "collecting must clear what it took"
 
 
-def test_collecting_from_many_particles(device):
-    """More than there are threads: every slot counts once, for its own muscle, is added to what is there, and cleared."""
+@pytest.mark.parametrize("in_order", [False, True])
+def test_collecting_from_many_particles(in_order, device):
+    """More than there are threads or partial sums: every slot counts once, for its own muscle, is added to the sum, and cleared."""
     spec = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64).spec
-    random = torch.Generator().manual_seed(0)
-    muscle = torch.randint(-1, 3, (2, 2 * COLLECTORS + 7, spec.muscle_slots), generator=random).int()
+    random, many = torch.Generator().manual_seed(0), 2 * max(COLLECTORS, PARTS) + 7
+    muscle = torch.randint(-1, 3, (2, many, spec.muscle_slots), generator=random).int()
     found = torch.randn(muscle.shape, generator=random, dtype=torch.float64)
     want = torch.stack([((muscle == k) * found).sum((1, 2)) for k in range(3)], 1)
     summed, slot = torch.ones(2, 3, dtype=torch.float64, device=device), found.to(device)
-    arrays = [wp.from_torch(tensor, requires_grad=False) for tensor in (muscle.to(device), slot, summed)]
-    wp.launch(
-        collect_slots(spec), collectors(muscle.shape), arrays, device=wp.device_from_torch(summed.device)
-    )
-    assert_relative(summed.cpu() - 1, want, 1e-12)
-    assert (slot.cpu() == torch.where(muscle < 0, found, 0.0)).all()
-
-
-def test_collecting_in_one_order_from_many_particles(device):
-    """More than there are partial sums: the same sums as in any order."""
-    spec = softmpm.build(busy_scene(2), device="cpu", dtype=torch.float64).spec
-    random = torch.Generator().manual_seed(0)
-    muscle = torch.randint(-1, 3, (2, 2 * PARTS + 7, spec.muscle_slots), generator=random).int()
-    found = torch.randn(muscle.shape, generator=random, dtype=torch.float64)
-    want = torch.stack([((muscle == k) * found).sum((1, 2)) for k in range(3)], 1)
-    summed, slot = torch.ones(2, 3, dtype=torch.float64, device=device), found.to(device)
-    part = torch.empty(2, 3, PARTS, dtype=torch.float64, device=device)
-    kernels, arrays = collect_slots_in_order(spec), [muscle.to(device), slot, part]
-    for kernel, size, tensors in (
-        (kernels.parts, part.shape, arrays),
-        (kernels.total, summed.shape, [part, summed]),
-    ):
-        views = [wp.from_torch(tensor, requires_grad=False) for tensor in tensors]
-        wp.launch(kernel, tuple(size), views, device=wp.device_from_torch(summed.device))
+    given = [muscle.to(device), slot]
+    if in_order:
+        part, kernels = summed.new_empty(2, 3, PARTS), collect_slots_in_order(spec)
+        launches = [(kernels.parts, (2, 3, PARTS), [*given, part]), (kernels.total, (2, 3), [part, summed])]
+    else:
+        launches = [(collect_slots(spec), collectors(muscle.shape), [*given, summed])]
+    for kernel, size, tensors in launches:
+        arrays = [wp.from_torch(tensor, requires_grad=False) for tensor in tensors]
+        wp.launch(kernel, size, arrays, device=wp.device_from_torch(summed.device))
     assert_relative(summed.cpu() - 1, want, 1e-12)
     assert (slot.cpu() == torch.where(muscle < 0, found, 0.0)).all()
 
