@@ -1,5 +1,5 @@
-"""Every term of every adjoint against the float64 oracle, in scenes so small that bench/mutants.py can run them for each; those of
-viscosity are in test_inputs.py."""
+"""Every term of the adjoints of the moving formulation against the float64 oracle, in scenes so small that bench/mutants.py can run
+them for each; those of viscosity are in test_inputs.py."""
 
 import dataclasses
 
