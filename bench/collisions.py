@@ -1,4 +1,4 @@
-"""Restitution of two blocks that meet head-on on the moving grid: `python bench/collisions.py [--json FILE]`
+"""Restitution of two blocks that meet head-on on the moving grid: `python bench/collisions.py [--device cpu] [--json FILE]`
 
 Two blocks of 0.1 x 0.05 m, cells of 10 mm, E 0.1 MPa (waves of 10 m/s), 30 Pa s, float64, approach each other from a gap of 2.5 cells.
 For each relative speed, as a part of the speed of waves, the velocity at which they part over that at which they met:
@@ -31,9 +31,9 @@ def blocks(place: float) -> softmpm.Scene:
     return dataclasses.replace(scene, dt=0.5 * float(softmpm.stable_dt(scene)))
 
 
-def restitution(speed: float, share: float, place: float) -> float:
+def restitution(speed: float, share: float, place: float, device: torch.device) -> float:
     """Relative velocity after three times the approach over that before, where the first block has ``share`` of it."""
-    model = softmpm.build(blocks(place), device="cpu", dtype=torch.float64, formulation="moving")
+    model = softmpm.build(blocks(place), device=device, dtype=torch.float64, formulation="moving")
     params, state, v = model.params(), model.rest(), speed * WAVES
     first = model.body == 0
     state.v[:, first, 0], state.v[:, ~first, 0] = share * v, (share - 1.0) * v
@@ -46,10 +46,13 @@ def restitution(speed: float, share: float, place: float) -> float:
 
 def main() -> None:
     args = arguments(__doc__ or "")
-    table = Table("Restitution of two blocks on the moving grid", torch.device("cpu"), args.json)
+    device = torch.device(args.device)
+    table = Table("Restitution of two blocks on the moving grid", device, args.json)
     for speed in SPEEDS:
-        row = {"speed / waves": speed, "symmetric": restitution(speed, 0.5, 0.0)}
-        table.add(row | {f"one moving, {place:g}": restitution(speed, 1.0, place) for place in PLACES})
+        row = {"speed / waves": speed, "symmetric": restitution(speed, 0.5, 0.0, device)}
+        table.add(
+            row | {f"one moving, {place:g}": restitution(speed, 1.0, place, device) for place in PLACES}
+        )
 
 
 if __name__ == "__main__":
